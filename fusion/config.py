@@ -1,0 +1,128 @@
+"""Every tunable number of the filter: a default, a unit, one line of meaning."""
+
+import msgspec
+
+
+class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the datasheet figures become process noise."""
+
+    noise_scale: float = 2.0
+    """White noise of gyro and accelerometer, times the datasheet's (vibration, quantization), -."""
+    max_gap_s: float = 0.5
+    """A longer pause in the IMU is coasted over at constant velocity, s."""
+    coast_accel: float = 2.0
+    """Acceleration assumed possible while coasting, m/s^2."""
+    coast_rate_deg: float = 20.0
+    """Turn rate assumed possible while coasting, deg/s."""
+
+
+class GnssModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """GNSS positions, velocities and dual-antenna yaw."""
+
+    use: bool = True
+    """Apply GNSS at all."""
+    min_status: int = 1
+    """Lowest status that is applied: 1 single, 2 DGNSS, 3 float, 4 fixed."""
+    sigma_floor_horizontal_m: float = 0.02
+    """Receivers claim 3 mm; below this a correct fix would be gated for ever, m."""
+    sigma_floor_vertical_m: float = 0.05
+    """The same, vertical, m."""
+    sigma_floor_velocity: float = 0.03
+    """The same for velocity, m/s."""
+    inflation: float = 4.0
+    """Position variance is multiplied by this: RTK errors are correlated in time, -."""
+    velocity_inflation: float = 1.0
+    """Velocity variance is multiplied by this, -."""
+    use_velocity: bool = True
+    """Apply GNSS velocities."""
+    yaw_sigma_floor_deg: float = 0.2
+    """Smallest sigma of a dual-antenna yaw, deg."""
+
+
+class PoseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """EgoVM's pose fixes."""
+
+    use: bool = True
+    """Apply pose fixes at all."""
+    inflation: float = 1.0
+    """The fix's covariance is multiplied by this, -."""
+    sigma_floor_m: float = 0.02
+    """Smallest sigma along any direction of the plane, m."""
+    sigma_floor_yaw_deg: float = 0.05
+    """Smallest sigma of yaw, deg."""
+    max_sigma_longitudinal_m: float = 0.47
+    """Covariance gate: a direction with more than this is not observed by the histogram and is dropped, m."""
+    max_sigma_lateral_m: float = 0.47
+    """The same, lateral, m."""
+    max_sigma_yaw_deg: float = 0.47
+    """The same, yaw, deg."""
+
+
+class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a land vehicle cannot do: slip sideways, fly, or move while it stands."""
+
+    non_holonomic: bool = True
+    """Apply zero lateral and vertical velocity of the rear axle."""
+    zero_velocity: bool = True
+    """Apply zero velocity and zero rate while the IMU shows that the vehicle stands."""
+    rate_hz: float = 10.0
+    """How often these are applied, Hz."""
+    lateral_sigma: float = 0.1
+    """Lateral velocity of the rear axle, m/s."""
+    vertical_sigma: float = 0.2
+    """Vertical velocity of the rear axle, m/s."""
+    sigma_per_speed: float = 0.01
+    """Growth of both with speed (mounting angles known to half a degree), m/s per m/s."""
+    min_speed: float = 2.0
+    """Below this speed the non-holonomic update waits, m/s."""
+    still_window_s: float = 1.0
+    """Window over which the IMU must be quiet, s."""
+    still_accel: float = 0.15
+    """Largest standard deviation of the acceleration's norm at rest, m/s^2."""
+    still_rate_deg: float = 0.5
+    """Largest standard deviation of each rate at rest, deg/s."""
+    still_max_speed: float = 0.5
+    """Above this estimated speed the vehicle is not taken to stand, m/s."""
+    zero_velocity_sigma: float = 0.02
+    """Velocity at rest, m/s."""
+    zero_rate_sigma_deg: float = 0.1
+    """Turn rate at rest, deg/s."""
+    wheel: bool = True
+    """Apply wheel speeds."""
+
+
+class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Chi-square gate on innovations."""
+
+    probability: float = 0.9999
+    """Probability that a correct measurement passes, -."""
+    use: bool = True
+    """Gate at all."""
+    max_streak_s: float = 2.0
+    """After this long with nothing but rejections of a sensor its next measurement is taken with a widened covariance, s."""
+
+
+class Alignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the first state is found."""
+
+    window_s: float = 1.0
+    """IMU window that is averaged for levelling, s."""
+    min_course_speed: float = 3.0
+    """GNSS course becomes yaw above this speed, m/s."""
+    course_sigma_deg: float = 2.0
+    """Added to the course's own sigma: side slip and mounting, deg."""
+    level_sigma_deg: float = 1.0
+    """Roll and pitch after levelling, deg."""
+
+
+class FusionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole filter."""
+
+    output_hz: float = 10.0
+    """Rate of the recorded states, Hz."""
+    imu: ImuNoise = ImuNoise()
+    gnss: GnssModel = GnssModel()
+    pose: PoseModel = PoseModel()
+    motion: MotionModel = MotionModel()
+    gates: Gates = Gates()
+    alignment: Alignment = Alignment()

@@ -1,0 +1,97 @@
+"""What a filter run returns: states on the output grid and one decision per measurement."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sensors.records import LeftOut
+
+Floats = NDArray[np.float64]
+
+
+class Sensor(IntEnum):
+    """Kinds of measurement."""
+
+    GNSS_POSITION = 0
+    GNSS_VELOCITY = 1
+    GNSS_YAW = 2
+    POSE_FIX = 3
+    WHEEL = 4
+    ZERO_VELOCITY = 5
+    NON_HOLONOMIC = 6
+
+
+class Reason(IntEnum):
+    """Why a measurement was applied or not."""
+
+    ACCEPTED = 0
+    PARTLY_ACCEPTED = 1
+    """Pose fix: unobserved directions dropped, the rest applied."""
+    CHI_SQUARE = 2
+    COVARIANCE = 3
+    """Pose fix: no direction is observed."""
+    STATUS = 4
+    """GNSS status below the configured one."""
+    SWITCHED_OFF = 5
+    BEFORE_ALIGNMENT = 6
+    OUTSIDE_IMU = 7
+    """No IMU samples at this time."""
+    HIDDEN = 8
+    """Kept from the filter on purpose."""
+    USED_FOR_ALIGNMENT = 9
+    WIDENED = 10
+    """Applied with a widened covariance after a streak of rejections."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class States:
+    """States at t_ns (N,), each after all measurements up to and including its time.
+
+    llh (N, 3); vel_enu (N, 3) m/s; q_enu_body (N, 4) xyzw; gyro_bias (N, 3) rad/s; accel_bias (N, 3) m/s^2;
+    cov (N, 15, 15) error covariance: position ENU m, velocity ENU m/s, attitude (left, ENU) rad, gyro bias, accel bias.
+    """
+
+    t_ns: NDArray[np.int64]
+    llh: Floats
+    vel_enu: Floats
+    q_enu_body: Floats
+    gyro_bias: Floats
+    accel_bias: Floats
+    cov: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decisions:
+    """One row per measurement, in the order of application.
+
+    t_ns, arrival_ns (M,); sensor, reason (M,) int8 (Sensor, Reason); row (M,) index into the log's record (-1: none);
+    innovation, innovation_sigma (M, 3), NaN where unused, in the measurement's own axes (GNSS: ENU; pose fix: map x m,
+    map y m, yaw rad; wheel and non-holonomic: body); nis, threshold (M,), dof (M,) int8;
+    moved_m, moved_yaw (M,): how far the update moved position (m) and yaw (rad).
+    """
+
+    t_ns: NDArray[np.int64]
+    arrival_ns: NDArray[np.int64]
+    sensor: NDArray[np.int8]
+    row: NDArray[np.int64]
+    reason: NDArray[np.int8]
+    innovation: Floats
+    innovation_sigma: Floats
+    nis: Floats
+    threshold: Floats
+    dof: NDArray[np.int8]
+    moved_m: Floats
+    moved_yaw: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusionResult:
+    """States, decisions, the time of the first state (None: never aligned, states are empty) and what was left out."""
+
+    states: States
+    decisions: Decisions
+    aligned_ns: int | None
+    left_out: Sequence[LeftOut] = ()

@@ -1,0 +1,55 @@
+"""What a filter needs to know of a vehicle: where its sensors sit and how good its IMU is."""
+
+from typing import Literal
+
+import msgspec
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class ImuSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Datasheet figures of an IMU. Default: the Epson G320N of the NovAtel PwrPak7D-E1 (the paper's unit)."""
+
+    name: str = "epson-g320n"
+    samples: Literal["rate", "increment"] = "rate"
+    """rate: instantaneous at the stamp; increment: mean over the interval that ends at the stamp."""
+    gyro_noise_deg_per_sqrt_h: float = 0.1
+    """Angle random walk, deg/sqrt(h)."""
+    accel_noise_m_per_s_per_sqrt_h: float = 0.05
+    """Velocity random walk, m/s/sqrt(h)."""
+    gyro_bias_instability_deg_per_h: float = 3.5
+    """Standard deviation of the drifting gyro bias (first-order Gauss-Markov), deg/h."""
+    accel_bias_instability_mg: float = 0.1
+    """Standard deviation of the drifting accelerometer bias (first-order Gauss-Markov), milli-g."""
+    bias_time_constant_s: float = 1000.0
+    """Correlation time of both drifting biases, s."""
+    gyro_turn_on_bias_deg_per_h: float = 360.0
+    """Standard deviation of the constant gyro bias at power-on, deg/h."""
+    accel_turn_on_bias_mg: float = 5.0
+    """Standard deviation of the constant accelerometer bias at power-on, milli-g."""
+
+
+class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Extrinsics in the body frame (FLU, origin at the IMU) and the IMU's datasheet.
+
+    Records hold IMU samples already rotated into body axes, so the IMU needs no rotation here.
+    """
+
+    imu: ImuSpec = ImuSpec()
+    gnss_lever_arm: Vector3 = (0.0, 0.0, 0.0)
+    """Main GNSS antenna, m, body frame."""
+    gnss_lever_arm_sigma_m: float = 0.0
+    """How well the antenna's place is known (each axis), m."""
+    pose_lever_arm: Vector3 = (0.0, 0.0, 0.0)
+    """Point whose pose EgoVM reports, m, body frame."""
+    rear_axle: Vector3 = (0.0, 0.0, 0.0)
+    """Point that moves along the vehicle's axis (non-holonomic constraint, wheel speed), m, body frame."""
+    reference_lever_arm: Vector3 = (0.0, 0.0, 0.0)
+    """Point whose trajectory the reference gives, m, body frame."""
+    gnss_delay_s: float = 0.0
+    """GNSS positions are true this long before their stamp, s (negative: after it)."""
+    gnss_velocity_delay_s: float = 0.0
+    """GNSS velocities are true this long before their stamp, s."""
+    land_vehicle: bool = True
+    """Wheels that do not slip sideways: zero-velocity and non-holonomic updates apply."""
