@@ -98,8 +98,6 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Probability that a correct measurement passes, -."""
     use: bool = True
     """Gate at all."""
-    max_streak_s: float = 2.0
-    """After this long with nothing but rejections of a sensor its next measurement is taken with a widened covariance, s."""
 
 
 class Alignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

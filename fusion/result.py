@@ -39,11 +39,7 @@ class Reason(IntEnum):
     BEFORE_ALIGNMENT = 6
     OUTSIDE_IMU = 7
     """No IMU samples at this time."""
-    HIDDEN = 8
-    """Kept from the filter on purpose."""
-    USED_FOR_ALIGNMENT = 9
-    WIDENED = 10
-    """Applied with a widened covariance after a streak of rejections."""
+    USED_FOR_ALIGNMENT = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
