@@ -10,10 +10,10 @@ class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """White noise of gyro and accelerometer, times the datasheet's (vibration, quantization), -."""
     max_gap_s: float = 0.5
     """A longer pause in the IMU is coasted over at constant velocity, s."""
-    coast_accel: float = 2.0
-    """Acceleration assumed possible while coasting, m/s^2."""
+    coast_accel: float = 3.0
+    """Random walk of velocity while coasting, m/s/sqrt(s)."""
     coast_rate_deg: float = 20.0
-    """Turn rate assumed possible while coasting, deg/s."""
+    """Random walk of yaw while coasting (a tenth of it tilts), deg/sqrt(s)."""
 
 
 class GnssModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -81,8 +81,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Largest standard deviation of the acceleration's norm at rest, m/s^2."""
     still_rate_deg: float = 0.5
     """Largest standard deviation of each rate at rest, deg/s."""
-    still_max_speed: float = 0.5
-    """Above this estimated speed the vehicle is not taken to stand, m/s."""
+    still_max_speed: float = 0.1
+    """Above this estimated speed (plus three sigmas) the vehicle is not taken to stand, m/s."""
     zero_velocity_sigma: float = 0.02
     """Velocity at rest, m/s."""
     zero_rate_sigma_deg: float = 0.1

@@ -1,0 +1,127 @@
+"""Strapdown integration on WGS-84 and the slow terms of its error dynamics (Groves 2013, ch. 5.4 and 14.2, in ENU)."""
+
+import math
+
+from numba import njit
+
+from fusion._linalg import (
+    Quaternion,
+    Vector,
+    axpy,
+    cross,
+    exp_q,
+    matvec,
+    multiply,
+    normalize,
+    rotation,
+)
+from fusion.state import Floats
+from sensors._kernels import EARTH_RATE, WGS84_A, gravity_enu, radii
+
+
+@njit(cache=True, inline="always")
+def increments(w0: Vector, w1: Vector, f0: Vector, f1: Vector, dt: float) -> tuple[Vector, Vector]:
+    """Rotation vector and velocity increment (axes at the start) over dt, rates and forces linear in between.
+
+    Coning dt^2/12 w0 x w1 and sculling dt^2/12 (w0 x f1 + f0 x w1) (Savage 1998); exact to dt^4 for linear signals.
+    """
+    turn = (0.5 * dt * (w0[0] + w1[0]), 0.5 * dt * (w0[1] + w1[1]), 0.5 * dt * (w0[2] + w1[2]))
+    push = (0.5 * dt * (f0[0] + f1[0]), 0.5 * dt * (f0[1] + f1[1]), 0.5 * dt * (f0[2] + f1[2]))
+    k = dt * dt / 12.0
+    turned = cross(turn, push)
+    dv = axpy(k, cross(f0, w1), axpy(k, cross(w0, f1), axpy(0.5, turned, push)))
+    return axpy(k, cross(w0, w1), turn), axpy(1.0 / 6.0, cross(turn, turned), dv)
+
+
+@njit(cache=True)
+def strapdown(nav: Floats, turn: Vector, push: Vector, dt: float) -> Vector:
+    """Advance nav (16,) in place by dt; return the specific-force velocity increment in ENU, m/s.
+
+    turn, push: bias-free rotation vector and velocity increment of the body (``increments``). Second order in dt:
+    Coriolis, transport and gravity at mid-step, position by the trapezoid of velocity.
+    """
+    lat, height = nav[0], nav[2]
+    q: Quaternion = (nav[6], nav[7], nav[8], nav[9])
+    sin_lat, cos_lat = math.sin(lat), math.cos(lat)
+    meridian, transverse = radii(sin_lat)
+    half = 0.5 * dt
+    g_north, g_up = gravity_enu(sin_lat, cos_lat, height + half * nav[5])
+    dv = matvec(rotation(q), push)
+    middle: Vector = (nav[3] + 0.5 * dv[0], nav[4] + 0.5 * dv[1] + half * g_north, nav[5] + 0.5 * dv[2] + half * g_up)
+    east_rate = middle[0] / (transverse + height)
+    w_ie: Vector = (0.0, EARTH_RATE * cos_lat, EARTH_RATE * sin_lat)
+    w_in = axpy(1.0, w_ie, (-middle[1] / (meridian + height), east_rate, east_rate * sin_lat / cos_lat))
+    coriolis = cross(axpy(1.0, w_ie, w_in), middle)
+    dv = axpy(-half, cross(w_in, dv), dv)
+    ve = nav[3] + dv[0] - coriolis[0] * dt
+    vn = nav[4] + dv[1] + (g_north - coriolis[1]) * dt
+    vu = nav[5] + dv[2] + (g_up - coriolis[2]) * dt
+
+    mean_height = height + 0.5 * half * (nav[5] + vu)
+    dlat = half * (nav[4] + vn) / (meridian + mean_height)
+    mid_cos = cos_lat - 0.5 * sin_lat * dlat
+    nav[0] = lat + dlat
+    nav[1] += half * (nav[3] + ve) / ((transverse + mean_height) * mid_cos)
+    nav[2] = height + half * (nav[5] + vu)
+    nav[3], nav[4], nav[5] = ve, vn, vu
+    frame = exp_q((-w_in[0] * dt, -w_in[1] * dt, -w_in[2] * dt))
+    nav[6], nav[7], nav[8], nav[9] = normalize(multiply(frame, multiply(q, exp_q(turn))))
+    return dv
+
+
+@njit(cache=True)
+def slow_dynamics(nav: Floats, F: Floats) -> None:
+    """Write the slow 9x9 part of the error dynamics into F (9, 15): earth, transport and gravity terms, 1/s.
+
+    Left out here: position against velocity (identity) and everything that the IMU's samples enter, which ``covariance``
+    integrates step by step. The change of the radii of curvature with latitude (0.3 % of these terms) is neglected.
+    """
+    ve, vn, vu = nav[3], nav[4], nav[5]
+    sin_lat, cos_lat = math.sin(nav[0]), math.cos(nav[0])
+    tan_lat = sin_lat / cos_lat
+    meridian, transverse = radii(sin_lat)
+    rm, rn = meridian + nav[2], transverse + nav[2]
+    e_rate, n_rate = ve / rn, vn / rm
+    ie_n, ie_u = EARTH_RATE * cos_lat, EARTH_RATE * sin_lat
+    F[:, :9] = 0.0
+
+    # position: ENU axes turn with the motion
+    F[0, 0] = vu / rn - tan_lat * n_rate
+    F[0, 1] = ve * tan_lat / rm
+    F[0, 2] = -e_rate
+    F[1, 1] = vu / rm
+    F[1, 2] = -n_rate
+
+    # velocity against position: earth rate and transport rate change with latitude and height, gravity with height
+    wu_lat = (2.0 * ie_n + e_rate / (cos_lat * cos_lat)) / rm
+    wn_lat = -2.0 * ie_u / rm
+    F[3, 1] = wu_lat * vn - wn_lat * vu
+    F[4, 1] = -wu_lat * ve
+    F[5, 1] = wn_lat * ve
+    F[3, 2] = -(e_rate * tan_lat * vn - e_rate * vu) / rn
+    F[4, 2] = e_rate * tan_lat * ve / rn + n_rate * vu / rm
+    F[5, 2] = -(e_rate * ve / rn + n_rate * vn / rm) + 2.0 * 9.8 / WGS84_A
+
+    # velocity against velocity: Coriolis and transport
+    F[3, 3] = (vn * tan_lat - vu) / rn
+    F[3, 4] = 2.0 * ie_u + e_rate * tan_lat
+    F[3, 5] = -(2.0 * ie_n + e_rate)
+    F[4, 3] = -(2.0 * ie_u + 2.0 * e_rate * tan_lat)
+    F[4, 4] = -vu / rm
+    F[4, 5] = -n_rate
+    F[5, 3] = 2.0 * ie_n + 2.0 * e_rate
+    F[5, 4] = 2.0 * n_rate
+
+    # attitude: the navigation frame turns by w_in, and w_in depends on position and velocity
+    F[6, 2] = -n_rate / rm
+    F[7, 1] = ie_u / rm
+    F[7, 2] = e_rate / rn
+    F[8, 1] = -(ie_n + e_rate / (cos_lat * cos_lat)) / rm
+    F[8, 2] = e_rate * tan_lat / rn
+    F[6, 4] = 1.0 / rm
+    F[7, 3] = -1.0 / rn
+    F[8, 3] = -tan_lat / rn
+    w_e, w_n, w_u = -n_rate, ie_n + e_rate, ie_u + e_rate * tan_lat
+    F[6, 7], F[6, 8] = w_u, -w_n
+    F[7, 6], F[7, 8] = -w_u, w_e
+    F[8, 6], F[8, 7] = w_n, -w_e

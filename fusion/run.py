@@ -1,0 +1,161 @@
+"""Batch run over a log: lay out the events, align, let the kernel go through them once."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion._kernels import OUTPUT, Events, Recorder, process
+from fusion.alignment import Aligner, Initial
+from fusion.config import FusionConfig
+from fusion.result import Decisions, FusionResult, Reason, States
+from fusion.state import ACCEL_BIAS, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core, Floats, new_core
+from fusion.timeline import APPLY, Sources, merge, parameters, sources
+from sensors.errors import EgolocError
+from sensors.records import Imu, LeftOut, Log
+
+
+def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
+    """Fuse a log in stamp order.
+
+    States come on multiples of the output period, from alignment to the last IMU sample. Raises EgolocError for a log
+    without IMU, or with pose fixes but no map frame.
+    """
+    config = config or FusionConfig()
+    imu = log.imu
+    if imu is None or len(imu) < 2:
+        raise EgolocError("the log has no IMU samples: expected sensor_msgs/msg/Imu on a topic")
+    found = sources(log, config)
+    par = parameters(log.vehicle, config)
+    order = np.lexsort((found.kind, found.t_ns))
+    initial = _align(log, config, found, order, imu)
+    if initial is None:
+        states, applied = _states(new_recorder(0, 0)), None
+        decided = _unused(found, order, Reason.BEFORE_ALIGNMENT)
+        return FusionResult(states, decided, None)
+    core = start(initial, imu)
+    last = int(imu.t_ns[-1])
+    events, arrival = merge(found, initial.t_ns + 1, last, config, log.vehicle.land_vehicle)
+    outputs = int((events.kind == OUTPUT).sum())
+    recorder = new_recorder(outputs, len(events.t) - outputs)
+    first = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right"))
+    process(core, imu.t_ns[first:], imu.gyro[first:], imu.accel[first:], events, 0, found.measurements, par, recorder)
+    applied = decisions(recorder, events, arrival)
+    before = order[found.t_ns[order] <= initial.t_ns]
+    early = _unused(found, before, Reason.BEFORE_ALIGNMENT, initial)
+    late = _unused(found, order[found.t_ns[order] > last], Reason.OUTSIDE_IMU)
+    gaps = int((np.diff(imu.t_ns) > config.imu.max_gap_s * 1e9).sum())
+    notes = (LeftOut("imu", f"gap over {config.imu.max_gap_s:g} s, coasted", gaps),) if gaps else ()
+    return FusionResult(_states(recorder), _join((early, applied, late)), initial.t_ns, notes)
+
+
+def _align(log: Log, config: FusionConfig, found: Sources, order: NDArray[np.int64], imu: Imu) -> Initial | None:
+    """Offer the measurements in stamp order until the aligner has a state."""
+    aligner = Aligner(log.vehicle, config, parameters(log.vehicle, config))
+    columns = (imu.t_ns, imu.gyro, imu.accel)
+    for i in order:
+        if found.verdict[i] == APPLY and imu.t_ns[0] <= found.t_ns[i] <= imu.t_ns[-1]:
+            t = int(found.t_ns[i])
+            initial = aligner.offer(t, int(found.kind[i]), int(found.row[i]), found.measurements, columns)
+            if initial is not None:
+                return initial
+    return None
+
+
+def start(initial: Initial, imu: Imu) -> Core:
+    """A core at the first state, with the IMU sample at or before it as the last one."""
+    core = new_core()
+    before = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right")) - 1
+    core.clock[0] = initial.t_ns
+    core.clock[1] = imu.t_ns[before]
+    core.clock[2] = initial.t_ns
+    core.nav[:], core.P[:] = initial.nav, initial.P
+    core.last[0, :3], core.last[0, 3:] = imu.gyro[before], imu.accel[before]
+    if before > 0:
+        core.clock[5] = imu.t_ns[before] - imu.t_ns[before - 1]
+        core.last[1, :3], core.last[1, 3:] = imu.gyro[before - 1], imu.accel[before - 1]
+    return core
+
+
+def new_recorder(states: int, decided: int) -> Recorder:
+    """Empty output arrays for so many states and decisions."""
+    return Recorder(
+        count=np.zeros(2, np.int64),
+        t=np.zeros(states, np.int64),
+        nav=np.zeros((states, 16)),
+        pose_cov=np.zeros((states, 6, 6)),
+        sigma_state=np.zeros((states, 15)),
+        event=np.zeros(decided, np.int64),
+        sensor=np.zeros(decided, np.int8),
+        reason=np.zeros(decided, np.int8),
+        dof=np.zeros(decided, np.int8),
+        innovation=np.full((decided, 3), np.nan),
+        sigma=np.full((decided, 3), np.nan),
+        scores=np.full((decided, 4), np.nan),
+        scratch=np.zeros((4, 3, 3)),
+        vectors=np.zeros((2, 15)),
+    )
+
+
+def _states(rec: Recorder) -> States:
+    n = int(rec.count[0])
+    nav = rec.nav[:n]
+    return States(
+        rec.t[:n],
+        nav[:, LLH],
+        nav[:, VELOCITY],
+        nav[:, QUATERNION],
+        nav[:, GYRO_BIAS],
+        nav[:, ACCEL_BIAS],
+        rec.pose_cov[:n],
+        rec.sigma_state[:n],
+    )
+
+
+def decisions(rec: Recorder, events: Events, arrival_ns: NDArray[np.int64]) -> Decisions:
+    """The recorder's decisions with the times and rows of their events."""
+    n = int(rec.count[1])
+    event, scores = rec.event[:n], rec.scores[:n]
+    return Decisions(
+        events.t[event],
+        arrival_ns[event],
+        rec.sensor[:n],
+        events.row[event],
+        rec.reason[:n],
+        rec.innovation[:n],
+        rec.sigma[:n],
+        scores[:, 0],
+        scores[:, 1],
+        rec.dof[:n],
+        scores[:, 2],
+        scores[:, 3],
+    )
+
+
+def _unused(found: Sources, rows: NDArray[np.int64], reason: Reason, initial: Initial | None = None) -> Decisions:
+    """Decisions for measurements that never reached the kernel; the one that completed alignment says so."""
+    n = len(rows)
+    nothing: Floats = np.full(n, np.nan)
+    reasons = np.where(found.verdict[rows] == APPLY, np.int8(reason), found.verdict[rows]).astype(np.int8)
+    if initial is not None:
+        used = (found.t_ns[rows] == initial.t_ns) & (found.kind[rows] == initial.sensor)
+        reasons[used] = Reason.USED_FOR_ALIGNMENT
+    return Decisions(
+        found.t_ns[rows],
+        found.arrival_ns[rows],
+        found.kind[rows],
+        found.row[rows],
+        reasons,
+        np.full((n, 3), np.nan),
+        np.full((n, 3), np.nan),
+        nothing,
+        nothing,
+        np.zeros(n, np.int8),
+        nothing,
+        nothing,
+    )
+
+
+def _join(parts: Sequence[Decisions]) -> Decisions:
+    names = Decisions.__dataclass_fields__
+    return Decisions(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
