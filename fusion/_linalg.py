@@ -2,7 +2,9 @@
 
 import math
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -66,6 +68,12 @@ def rotation(q: Quaternion) -> Matrix:
         2.0 * (yz + wx),
         1.0 - 2.0 * (xx + yy),
     )
+
+
+@njit(cache=True, inline="always")
+def attitude(nav: NDArray[np.float64]) -> Matrix:
+    """R_enu_body of nav (16,)."""
+    return rotation((nav[6], nav[7], nav[8], nav[9]))
 
 
 @njit(cache=True, inline="always")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion._kernels import Measurements, Parameters
+from fusion.events import Measurements, Parameters
 from fusion.config import FusionConfig
 from fusion.result import Sensor
 from fusion.state import (

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from numba import njit
 
-from fusion._linalg import Quaternion, Vector, rotation
+from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
-from fusion.state import Core
+from fusion.state import A_S, A_U, ROW, Core, Floats
 
 
 class Noise(NamedTuple):
@@ -24,112 +24,96 @@ class Noise(NamedTuple):
     bias_rate: float
 
 
-@njit(cache=True)
-def accumulate(core: Core, dv: Vector, dt: float) -> None:
-    """Add one IMU step: dv (m/s, ENU) is its velocity increment; nav holds the state at the step's start.
+@njit(cache=True, inline="always")
+def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, dt: float) -> None:
+    """Add one IMU step to the transition: r is R_enu_body at its start, dv its velocity increment (m/s, ENU).
 
     dtheta' = -R dbg, dv' = -[f]x dtheta - R dba, dp' = dv, each constant over the step.
     """
-    nav, S, SS, Vg, Pg, s, u = core.nav, core.S, core.SS, core.Vg, core.Pg, core.s, core.u
-    q: Quaternion = (nav[6], nav[7], nav[8], nav[9])
-    r = rotation(q)
-    half = 0.5 * dt
     for j in range(3):
         a0, a1, a2 = r[j] * dt, r[3 + j] * dt, r[6 + j] * dt
-        # attitude error in mid-step per gyro bias: -(S + A/2); velocity changes by -dv x that
-        m0, m1, m2 = S[0, j] + 0.5 * a0, S[1, j] + 0.5 * a1, S[2, j] + 0.5 * a2
-        g0, g1, g2 = dv[1] * m2 - dv[2] * m1, dv[2] * m0 - dv[0] * m2, dv[0] * m1 - dv[1] * m0
-        Pg[0, j] += dt * (Vg[0, j] + 0.5 * g0)
-        Pg[1, j] += dt * (Vg[1, j] + 0.5 * g1)
-        Pg[2, j] += dt * (Vg[2, j] + 0.5 * g2)
-        Vg[0, j] += g0
-        Vg[1, j] += g1
-        Vg[2, j] += g2
-        SS[0, j] += dt * m0
-        SS[1, j] += dt * m1
-        SS[2, j] += dt * m2
-        S[0, j] += a0
-        S[1, j] += a1
-        S[2, j] += a2
-    for i in range(3):
-        u[i] += dt * s[i] + half * dv[i]
-        s[i] += dv[i]
-    core.span[0] += dt
+        # attitude error in mid-step per gyro bias is -m; velocity changes by dv x m
+        m: Vector = (acc[2, j] + 0.5 * a0, acc[3, j] + 0.5 * a1, acc[4, j] + 0.5 * a2)
+        g = cross(dv, m)
+        for i in range(3):
+            acc[11 + i, j] += dt * (acc[8 + i, j] + 0.5 * g[i])
+            acc[8 + i, j] += g[i]
+            acc[5 + i, j] += dt * m[i]
+        acc[2, j] += a0
+        acc[3, j] += a1
+        acc[4, j] += a2
+        acc[A_U, j] += dt * (acc[A_S, j] + 0.5 * dv[j])
+        acc[A_S, j] += dv[j]
+    span[0] += dt
 
 
 @njit(cache=True)
-def transition(core: Core) -> None:
-    """Write Phi (9, 15), the upper rows of the transition over the accumulated span; biases decay on their own."""
-    Phi, s, u = core.Phi, core.s, core.u
-    span = core.span[0]
-    slow_dynamics(core.nav, Phi)
+def transition(nav: Floats, acc: Floats, span: float, phi: Floats) -> None:
+    """Write phi (9, 16), the upper rows of the transition over the accumulated span; biases decay on their own."""
+    slow_dynamics(nav, phi)
     for i in range(9):
         for j in range(9):
-            Phi[i, j] *= span
-        Phi[i, i] += 1.0
+            phi[i, j] *= span
+        phi[i, i] += 1.0
     for i in range(3):
-        Phi[i, 3 + i] += span
+        phi[i, 3 + i] += span
         for j in range(3):
-            Phi[i, 9 + j] = core.Pg[i, j]
-            Phi[i, 12 + j] = -core.SS[i, j]
-            Phi[3 + i, 9 + j] = core.Vg[i, j]
-            Phi[3 + i, 12 + j] = -core.S[i, j]
-            Phi[6 + i, 9 + j] = -core.S[i, j]
-            Phi[6 + i, 12 + j] = 0.0
+            phi[i, 9 + j] = acc[11 + i, j]
+            phi[i, 12 + j] = -acc[5 + i, j]
+            phi[3 + i, 9 + j] = acc[8 + i, j]
+            phi[3 + i, 12 + j] = -acc[2 + i, j]
+            phi[6 + i, 9 + j] = -acc[2 + i, j]
     # -[u]x and -[s]x: position and velocity against attitude
-    for row, a in ((0, u), (3, s)):
-        Phi[row, 7] += a[2]
-        Phi[row, 8] -= a[1]
-        Phi[row + 1, 6] -= a[2]
-        Phi[row + 1, 8] += a[0]
-        Phi[row + 2, 6] += a[1]
-        Phi[row + 2, 7] -= a[0]
+    for row, a in ((0, A_U), (3, A_S)):
+        phi[row, 7] += acc[a, 2]
+        phi[row, 8] -= acc[a, 1]
+        phi[row + 1, 6] -= acc[a, 2]
+        phi[row + 1, 8] += acc[a, 0]
+        phi[row + 2, 6] += acc[a, 1]
+        phi[row + 2, 7] -= acc[a, 0]
 
 
-@njit(cache=True, fastmath={"contract", "reassoc"})
-def propagate(core: Core, noise: Noise) -> None:
-    """P = Phi P Phi' + Q over the accumulated span, which is then empty."""
-    span = core.span[0]
-    if span == 0.0:
-        return
-    transition(core)
-    Phi, M, P = core.Phi, core.M, core.P
-    decay = math.exp(-noise.bias_rate * span)
+@njit(cache=True, fastmath={"contract"})
+def _product(phi: Floats, X: Floats, Y: Floats) -> None:
+    """Y (9, 16) = phi (9, 16) X (15, 16). The sum stands inside: the compiler keeps it in vector registers."""
     for i in range(9):
-        for j in range(15):
-            M[i, j] = 0.0
-        for k in range(15):
-            phi = Phi[i, k]
-            if phi != 0.0:
-                for j in range(15):
-                    M[i, j] += phi * P[k, j]
-    for i in range(9):
-        for j in range(i + 1):
+        for j in range(ROW):
             total = 0.0
             for k in range(15):
-                total += M[i, k] * Phi[j, k]
-            P[i, j] = total
-            P[j, i] = total
+                total += phi[i, k] * X[k, j]
+            Y[i, j] = total
+
+
+@njit(cache=True)
+def propagate(core: Core, noise: Noise) -> None:
+    """P = Phi P Phi' + Q over the accumulated span, which is then empty."""
+    span, P, M, Mt, acc = core.span[0], core.P, core.M, core.Mt, core.acc
+    if span == 0.0:
+        return
+    transition(core.nav, acc, span, core.phi)
+    _product(core.phi, P, M)
+    for k in range(15):
+        for i in range(9):
+            Mt[k, i] = M[i, k]
+    decay = math.exp(-noise.bias_rate * span)
+    for i in range(9):
         for j in range(9, 15):
-            P[i, j] = M[i, j] * decay
-            P[j, i] = P[i, j]
+            P[i, j] = P[j, i] = M[i, j] * decay
     for i in range(9, 15):
         for j in range(9, 15):
             P[i, j] *= decay * decay
-    _add_noise(core, noise, span, 1.0 - decay * decay)
+    _product(core.phi, Mt, M)
+    for i in range(9):
+        for j in range(i + 1):
+            P[i, j] = P[j, i] = M[i, j]
+    _add_noise(P, acc, noise, span, 1.0 - decay * decay)
     core.span[0] = 0.0
-    core.s[:] = 0.0
-    core.u[:] = 0.0
-    core.S[:] = 0.0
-    core.SS[:] = 0.0
-    core.Vg[:] = 0.0
-    core.Pg[:] = 0.0
+    acc[:] = 0.0
 
 
 @njit(cache=True)
-def _add_noise(core: Core, noise: Noise, span: float, refilled: float) -> None:
+def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float, refilled: float) -> None:
     """Q of white noise integrated over the span (van Loan's integral, to the leading order of each block)."""
-    P, s = core.P, core.s
     qa, qg = noise.accel_psd * span, noise.gyro_psd * span
     for i in range(3):
         P[i, i] += qa * span * span / 3.0
@@ -141,22 +125,15 @@ def _add_noise(core: Core, noise: Noise, span: float, refilled: float) -> None:
         P[12 + i, 12 + i] += noise.accel_bias_var * refilled
     # velocity against attitude: -[s]x qg / 2
     half = 0.5 * qg
-    for i, j, value in (
-        (3, 7, s[2]),
-        (3, 8, -s[1]),
-        (4, 6, -s[2]),
-        (4, 8, s[0]),
-        (5, 6, s[1]),
-        (5, 7, -s[0]),
-    ):
-        P[i, j] += half * value
-        P[j, i] += half * value
+    x, y, z = half * acc[A_S, 0], half * acc[A_S, 1], half * acc[A_S, 2]
+    for i, j, value in ((3, 7, z), (3, 8, -y), (4, 6, -z), (4, 8, x), (5, 6, y), (5, 7, -x)):
+        P[i, j] += value
+        P[j, i] += value
 
 
 @njit(cache=True)
-def coast(core: Core, seconds: float, accel: float, rate: float) -> None:
+def coast(P: Floats, seconds: float, accel: float, rate: float) -> None:
     """Widen P over a gap in the IMU: velocity and attitude walk by accel (m/s) and rate (rad) in the first second."""
-    P = core.P
     for i in range(15):
         for k in range(3):
             P[k, i] += seconds * P[3 + k, i]

@@ -4,19 +4,24 @@ import math
 
 from numba import njit
 
-from fusion._linalg import (
-    Quaternion,
-    Vector,
-    axpy,
-    cross,
-    exp_q,
-    matvec,
-    multiply,
-    normalize,
-    rotation,
+from fusion._linalg import Quaternion, Vector, axpy, cross, exp_q, multiply, normalize
+from fusion.state import (
+    G_AGE,
+    G_COS,
+    G_HEIGHT,
+    G_MERIDIAN,
+    G_NORTH,
+    G_SIN,
+    G_TRANSVERSE,
+    G_UP,
+    Floats,
 )
-from fusion.state import Floats
-from sensors._kernels import EARTH_RATE, WGS84_A, gravity_enu, radii
+from sensors._kernels import EARTH_RATE, gravity_enu, radii
+
+MAX_AGE_S = 0.1
+"""Radii of curvature and gravity are refreshed after this long."""
+GRAVITY_GRADIENT = 3.086e-6
+"""Fall of gravity with height, 1/s^2 (free air)."""
 
 
 @njit(cache=True, inline="always")
@@ -34,44 +39,61 @@ def increments(w0: Vector, w1: Vector, f0: Vector, f1: Vector, dt: float) -> tup
 
 
 @njit(cache=True)
-def strapdown(nav: Floats, turn: Vector, push: Vector, dt: float) -> Vector:
-    """Advance nav (16,) in place by dt; return the specific-force velocity increment in ENU, m/s.
-
-    turn, push: bias-free rotation vector and velocity increment of the body (``increments``). Second order in dt:
-    Coriolis, transport and gravity at mid-step, position by the trapezoid of velocity.
-    """
-    lat, height = nav[0], nav[2]
-    q: Quaternion = (nav[6], nav[7], nav[8], nav[9])
-    sin_lat, cos_lat = math.sin(lat), math.cos(lat)
+def refresh(nav: Floats, earth: Floats) -> None:
+    """Recompute what depends on the place (G_*): radii of curvature and gravity there."""
+    sin_lat, cos_lat, height = math.sin(nav[0]), math.cos(nav[0]), nav[2]
     meridian, transverse = radii(sin_lat)
-    half = 0.5 * dt
-    g_north, g_up = gravity_enu(sin_lat, cos_lat, height + half * nav[5])
-    dv = matvec(rotation(q), push)
-    middle: Vector = (nav[3] + 0.5 * dv[0], nav[4] + 0.5 * dv[1] + half * g_north, nav[5] + 0.5 * dv[2] + half * g_up)
-    east_rate = middle[0] / (transverse + height)
-    w_ie: Vector = (0.0, EARTH_RATE * cos_lat, EARTH_RATE * sin_lat)
-    w_in = axpy(1.0, w_ie, (-middle[1] / (meridian + height), east_rate, east_rate * sin_lat / cos_lat))
-    coriolis = cross(axpy(1.0, w_ie, w_in), middle)
-    dv = axpy(-half, cross(w_in, dv), dv)
-    ve = nav[3] + dv[0] - coriolis[0] * dt
-    vn = nav[4] + dv[1] + (g_north - coriolis[1]) * dt
-    vu = nav[5] + dv[2] + (g_up - coriolis[2]) * dt
+    north, up = gravity_enu(sin_lat, cos_lat, height)
+    earth[G_SIN], earth[G_COS] = sin_lat, cos_lat
+    earth[G_MERIDIAN], earth[G_TRANSVERSE] = 1.0 / (meridian + height), 1.0 / (transverse + height)
+    earth[G_NORTH], earth[G_UP], earth[G_HEIGHT] = north, up, height
+    earth[G_AGE] = 0.0
 
-    mean_height = height + 0.5 * half * (nav[5] + vu)
-    dlat = half * (nav[4] + vn) / (meridian + mean_height)
-    mid_cos = cos_lat - 0.5 * sin_lat * dlat
-    nav[0] = lat + dlat
-    nav[1] += half * (nav[3] + ve) / ((transverse + mean_height) * mid_cos)
-    nav[2] = height + half * (nav[5] + vu)
+
+@njit(cache=True, inline="always")
+def strapdown(nav: Floats, earth: Floats, turn: Vector, dv: Vector, dt: float) -> None:
+    """Advance nav (16,) in place by dt.
+
+    turn: rotation vector of the body against inertial space, body axes; dv: specific force integrated, ENU axes at the
+    start. Second order in dt: Coriolis, transport and gravity at mid-step, position by the trapezoid of velocity. Latitude's
+    sine and cosine follow by first-order steps; radii wait for ``refresh``: over 0.1 s they change by 1e-8 of themselves.
+    """
+    if earth[G_AGE] > MAX_AGE_S:
+        refresh(nav, earth)
+    earth[G_AGE] += dt
+    sin_lat, cos_lat, m, n = earth[G_SIN], earth[G_COS], earth[G_MERIDIAN], earth[G_TRANSVERSE]
+    half = 0.5 * dt
+    secant = 1.0 / cos_lat
+    g_north = earth[G_NORTH]
+    g_up = earth[G_UP] + GRAVITY_GRADIENT * (nav[2] - earth[G_HEIGHT] + half * nav[5])
+
+    middle: Vector = (nav[3] + 0.5 * dv[0], nav[4] + 0.5 * dv[1] + half * g_north, nav[5] + 0.5 * dv[2] + half * g_up)
+    east_rate = middle[0] * n
+    w_ie: Vector = (0.0, EARTH_RATE * cos_lat, EARTH_RATE * sin_lat)
+    w_in = axpy(1.0, w_ie, (-middle[1] * m, east_rate, east_rate * sin_lat * secant))
+    coriolis = cross(axpy(1.0, w_ie, w_in), middle)
+    tilted = cross(w_in, dv)
+    ve = nav[3] + dv[0] - half * tilted[0] - coriolis[0] * dt
+    vn = nav[4] + dv[1] - half * tilted[1] + (g_north - coriolis[1]) * dt
+    vu = nav[5] + dv[2] - half * tilted[2] + (g_up - coriolis[2]) * dt
+
+    rise = half * (nav[5] + vu)
+    above = nav[2] - earth[G_HEIGHT] + 0.5 * rise
+    dlat = half * (nav[4] + vn) * m * (1.0 - above * m)
+    nav[0] += dlat
+    nav[1] += half * (nav[3] + ve) * n * (1.0 - above * n) * secant * (1.0 + 0.5 * sin_lat * secant * dlat)
+    nav[2] += rise
     nav[3], nav[4], nav[5] = ve, vn, vu
+    earth[G_SIN], earth[G_COS] = sin_lat + cos_lat * dlat, cos_lat - sin_lat * dlat
+
+    q: Quaternion = (nav[6], nav[7], nav[8], nav[9])
     frame = exp_q((-w_in[0] * dt, -w_in[1] * dt, -w_in[2] * dt))
     nav[6], nav[7], nav[8], nav[9] = normalize(multiply(frame, multiply(q, exp_q(turn))))
-    return dv
 
 
 @njit(cache=True)
 def slow_dynamics(nav: Floats, F: Floats) -> None:
-    """Write the slow 9x9 part of the error dynamics into F (9, 15): earth, transport and gravity terms, 1/s.
+    """Write the slow 9x9 part of the error dynamics into F (9, 16): earth, transport and gravity terms, 1/s.
 
     Left out here: position against velocity (identity) and everything that the IMU's samples enter, which ``covariance``
     integrates step by step. The change of the radii of curvature with latitude (0.3 % of these terms) is neglected.
@@ -100,7 +122,7 @@ def slow_dynamics(nav: Floats, F: Floats) -> None:
     F[5, 1] = wn_lat * ve
     F[3, 2] = -(e_rate * tan_lat * vn - e_rate * vu) / rn
     F[4, 2] = e_rate * tan_lat * ve / rn + n_rate * vu / rm
-    F[5, 2] = -(e_rate * ve / rn + n_rate * vn / rm) + 2.0 * 9.8 / WGS84_A
+    F[5, 2] = -(e_rate * ve / rn + n_rate * vn / rm) + GRAVITY_GRADIENT
 
     # velocity against velocity: Coriolis and transport
     F[3, 3] = (vn * tan_lat - vu) / rn

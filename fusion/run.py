@@ -5,11 +5,26 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion._kernels import OUTPUT, Events, Recorder, process
+from fusion._kernels import process
 from fusion.alignment import Aligner, Initial
 from fusion.config import FusionConfig
+from fusion.events import OUTPUT, Events, Recorder, new_recorder
 from fusion.result import Decisions, FusionResult, Reason, States
-from fusion.state import ACCEL_BIAS, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core, Floats, new_core
+from fusion.state import (
+    ACCEL_BIAS,
+    C_INTERVAL,
+    C_SAMPLE,
+    C_STATE,
+    C_TICK,
+    GYRO_BIAS,
+    LLH,
+    QUATERNION,
+    VELOCITY,
+    Core,
+    Floats,
+    covariance,
+    new_core,
+)
 from fusion.timeline import APPLY, Sources, merge, parameters, sources
 from sensors.errors import EgolocError
 from sensors.records import Imu, LeftOut, Log
@@ -66,35 +81,16 @@ def start(initial: Initial, imu: Imu) -> Core:
     """A core at the first state, with the IMU sample at or before it as the last one."""
     core = new_core()
     before = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right")) - 1
-    core.clock[0] = initial.t_ns
-    core.clock[1] = imu.t_ns[before]
-    core.clock[2] = initial.t_ns
-    core.nav[:], core.P[:] = initial.nav, initial.P
+    core.clock[C_STATE] = initial.t_ns
+    core.clock[C_SAMPLE] = imu.t_ns[before]
+    core.clock[C_TICK] = initial.t_ns
+    core.nav[:] = initial.nav
+    covariance(core)[:] = initial.P
     core.last[0, :3], core.last[0, 3:] = imu.gyro[before], imu.accel[before]
     if before > 0:
-        core.clock[5] = imu.t_ns[before] - imu.t_ns[before - 1]
+        core.clock[C_INTERVAL] = imu.t_ns[before] - imu.t_ns[before - 1]
         core.last[1, :3], core.last[1, 3:] = imu.gyro[before - 1], imu.accel[before - 1]
     return core
-
-
-def new_recorder(states: int, decided: int) -> Recorder:
-    """Empty output arrays for so many states and decisions."""
-    return Recorder(
-        count=np.zeros(2, np.int64),
-        t=np.zeros(states, np.int64),
-        nav=np.zeros((states, 16)),
-        pose_cov=np.zeros((states, 6, 6)),
-        sigma_state=np.zeros((states, 15)),
-        event=np.zeros(decided, np.int64),
-        sensor=np.zeros(decided, np.int8),
-        reason=np.zeros(decided, np.int8),
-        dof=np.zeros(decided, np.int8),
-        innovation=np.full((decided, 3), np.nan),
-        sigma=np.full((decided, 3), np.nan),
-        scores=np.full((decided, 4), np.nan),
-        scratch=np.zeros((4, 3, 3)),
-        vectors=np.zeros((2, 15)),
-    )
 
 
 def _states(rec: Recorder) -> States:

@@ -30,15 +30,41 @@ RING_SIZE = 2048
 """IMU samples kept to see whether the vehicle stands still."""
 
 
+ROW = 16
+"""Rows of P, H and Phi are padded from 15 to 16 so that they fill vector registers; the last column stays zero."""
+
+# rows of Core.acc, each (., 3)
+A_S = 0
+"""Integral of specific force, ENU m/s."""
+A_U = 1
+"""Its integral, m."""
+A_R = slice(2, 5)
+"""Integral of R_enu_body, s."""
+A_RR = slice(5, 8)
+"""Its integral, s^2."""
+A_VG = slice(8, 11)
+"""Velocity against gyro bias."""
+A_PG = slice(11, 14)
+"""Position against gyro bias."""
+ACC_SIZE = 14
+
+# entries of Core.earth
+G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8)
+
+# entries of Core.clock
+C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)
+
+
 class Core(NamedTuple):
     """Everything that the kernels change between calls (arrays, written in place).
 
-    clock (6,) int64: time of the state, of the last IMU sample, of the last motion tick (ns), samples in the ring so far,
-    whether last[1] serves, the interval before the last sample (ns).
-    nav (16,), P (15, 15); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
-    The transition since P was last propagated, in ENU: span (1,) s; s, u (3,) velocity increment and its integral;
-    S, SS (3, 3) integral of R_enu_body and its integral; Vg, Pg (3, 3) velocity and position against gyro bias.
-    ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples. Phi, M (9, 15), H, PHt (3, 15): scratch.
+    clock (6,) int64: times of the state, the last IMU sample and the last motion tick (ns), samples put into the ring,
+    whether the sample before the last serves the bend, the interval before the last sample (ns).
+    nav (16,); P (15, 16); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
+    span (1,): seconds since P was propagated; acc (14, 3): the transition over them (A_*).
+    earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
+    ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
+    phi, M (9, 16), Mt (15, 16), H, W (3, 16), R, L (3, 3), residual (3,), dx (16,): scratch.
     """
 
     clock: NDArray[np.int64]
@@ -46,18 +72,19 @@ class Core(NamedTuple):
     P: Floats
     last: Floats
     span: Floats
-    s: Floats
-    u: Floats
-    S: Floats
-    SS: Floats
-    Vg: Floats
-    Pg: Floats
+    acc: Floats
+    earth: Floats
     ring: Floats
     ring_t: NDArray[np.int64]
-    Phi: Floats
+    phi: Floats
     M: Floats
+    Mt: Floats
     H: Floats
-    PHt: Floats
+    W: Floats
+    R: Floats
+    L: Floats
+    residual: Floats
+    dx: Floats
 
 
 def new_core() -> Core:
@@ -65,19 +92,25 @@ def new_core() -> Core:
     return Core(
         clock=np.zeros(6, np.int64),
         nav=np.zeros(NAV_SIZE),
-        P=np.zeros((ERROR_SIZE, ERROR_SIZE)),
+        P=np.zeros((ERROR_SIZE, ROW)),
         last=np.zeros((2, 6)),
         span=np.zeros(1),
-        s=np.zeros(3),
-        u=np.zeros(3),
-        S=np.zeros((3, 3)),
-        SS=np.zeros((3, 3)),
-        Vg=np.zeros((3, 3)),
-        Pg=np.zeros((3, 3)),
+        acc=np.zeros((ACC_SIZE, 3)),
+        earth=np.zeros(8),
         ring=np.zeros((RING_SIZE, 6)),
         ring_t=np.zeros(RING_SIZE, np.int64),
-        Phi=np.zeros((9, ERROR_SIZE)),
-        M=np.zeros((9, ERROR_SIZE)),
-        H=np.zeros((3, ERROR_SIZE)),
-        PHt=np.zeros((3, ERROR_SIZE)),
+        phi=np.zeros((9, ROW)),
+        M=np.zeros((9, ROW)),
+        Mt=np.zeros((ERROR_SIZE, ROW)),
+        H=np.zeros((3, ROW)),
+        W=np.zeros((3, ROW)),
+        R=np.zeros((3, 3)),
+        L=np.zeros((3, 3)),
+        residual=np.zeros(3),
+        dx=np.zeros(ROW),
     )
+
+
+def covariance(core: Core) -> Floats:
+    """P as a (15, 15) view."""
+    return core.P[:, :ERROR_SIZE]

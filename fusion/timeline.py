@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion._kernels import MOTION, OUTPUT, Events, Measurements, Parameters
+from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters
 from fusion.config import FusionConfig
 from fusion.covariance import Noise
 from fusion.result import Reason, Sensor

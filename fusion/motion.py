@@ -1,0 +1,100 @@
+"""What a land vehicle cannot do: slip sideways, or move while it stands."""
+
+import numpy as np
+from numba import njit
+
+from fusion._linalg import Vector, attitude, matvec_t
+from fusion.events import Parameters
+from fusion.gating import correct, innovate, whiten
+from fusion.measurements import body_velocity
+from fusion.result import Sensor
+from fusion.state import C_COUNT, C_TICK, RING_SIZE, Core
+from sensors._kernels import EARTH_RATE
+
+_ZERO_VELOCITY = int(Sensor.ZERO_VELOCITY)
+_NON_HOLONOMIC = int(Sensor.NON_HOLONOMIC)
+
+
+@njit(cache=True)
+def still(core: Core, par: Parameters, now: int) -> tuple[bool, float, float, float]:
+    """Whether the IMU was quiet over the window before now, and its mean rate since the last motion tick, rad/s."""
+    count = core.clock[C_COUNT]
+    total = np.zeros(3)
+    squares = np.zeros(3)
+    recent = np.zeros(3)
+    norm, norm2 = 0.0, 0.0
+    n, fresh = 0, 0
+    oldest = now
+    for back in range(min(count, RING_SIZE)):
+        i = (count - 1 - back) % RING_SIZE
+        t = core.ring_t[i]
+        if t <= now - par.still_window_ns:
+            break
+        oldest = t
+        n += 1
+        for k in range(3):
+            rate = core.ring[i, k] - core.nav[10 + k]
+            total[k] += rate
+            squares[k] += rate * rate
+        if t > core.clock[C_TICK]:
+            fresh += 1
+            for k in range(3):
+                recent[k] += core.ring[i, k]
+        f2 = core.ring[i, 3] ** 2 + core.ring[i, 4] ** 2 + core.ring[i, 5] ** 2
+        norm += np.sqrt(f2)
+        norm2 += f2
+    if n < 5 or fresh == 0 or now - oldest < 0.8 * par.still_window_ns:
+        return False, 0.0, 0.0, 0.0
+    quiet = norm2 / n - (norm / n) ** 2 < par.still_accel_var
+    for k in range(3):
+        mean = total[k] / n
+        quiet = quiet and squares[k] / n - mean * mean < par.still_rate_var
+    return quiet, recent[0] / fresh, recent[1] / fresh, recent[2] / fresh
+
+
+@njit(cache=True)
+def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, int]:
+    """Residual, H and R of what the motion allows: sensor and degrees of freedom, 0 for nothing.
+
+    Zero velocity at rest (with the gyro's bias from its mean rate); else no lateral and vertical velocity of the rear axle.
+    """
+    nav, P, R, residual = core.nav, core.P, core.R, core.residual
+    speed = np.sqrt(nav[3] ** 2 + nav[4] ** 2 + nav[5] ** 2)
+    quiet = False
+    if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4] + P[5, 5]):
+        quiet, w0, w1, w2 = still(core, par, now)
+        if quiet:
+            _zero_rate(core, par, (w0, w1, w2))
+    core.clock[C_TICK] = now
+    R[:] = 0.0
+    core.H[:] = 0.0
+    if quiet:
+        for i in range(3):
+            core.H[i, 3 + i] = 1.0
+            R[i, i] = par.zero_velocity_var
+            residual[i] = -nav[3 + i]
+        return _ZERO_VELOCITY, 3
+    if not par.non_holonomic or speed < par.min_speed:
+        return _NON_HOLONOMIC, 0
+    velocity = body_velocity(nav, attitude(nav), core.H, par.axle, rate)
+    for j in range(15):  # lateral and vertical rows first
+        core.H[0, j], core.H[1, j], core.H[2, j] = core.H[1, j], core.H[2, j], 0.0
+    extra = (par.per_speed * speed) ** 2
+    R[0, 0], R[1, 1] = par.lateral_var + extra, par.vertical_var + extra
+    residual[0], residual[1] = -velocity[1], -velocity[2]
+    return _NON_HOLONOMIC, 2
+
+
+@njit(cache=True)
+def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
+    """At rest the gyro shows its bias and the earth's turning: mean = bg + R' omega_ie. Gated, not recorded on its own."""
+    nav, R, residual = core.nav, core.R, core.residual
+    earth = matvec_t(attitude(nav), (0.0, EARTH_RATE * np.cos(nav[0]), EARTH_RATE * np.sin(nav[0])))
+    R[:] = 0.0
+    core.H[:] = 0.0
+    for i in range(3):
+        core.H[i, 9 + i] = 1.0
+        R[i, i] = par.zero_rate_var
+        residual[i] = mean[i] - earth[i] - nav[10 + i]
+    if innovate(core.P, core.H, core.W, 3, R, core.L) and whiten(3, residual, core.L) <= par.gate[2]:
+        correct(core, residual)
