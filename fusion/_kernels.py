@@ -55,7 +55,6 @@ def process(
     e = first_event
     events = len(ev.t)
     nav, earth, acc, span, clock = core.nav, core.earth, core.acc, core.span, core.clock
-    refresh(nav, earth)
     for i in range(len(imu_t)):
         t, start = imu_t[i], clock[C_SAMPLE]
         whole = t - start
@@ -151,10 +150,10 @@ def _remember(core: Core, t: int, w: Vector, f: Vector) -> None:
     core.clock[C_COUNT] += 1
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _coast(core: Core, par: Parameters, dt: float) -> None:
     """Bridge a gap in the IMU at constant velocity and attitude, with the covariance widened."""
-    propagate(core, par.noise)
+    propagate(core.nav, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
     nav = core.nav
     meridian, transverse = radii(np.sin(nav[0]))
     nav[1] += nav[3] * dt / ((transverse + nav[2]) * np.cos(nav[0]))
@@ -164,14 +163,14 @@ def _coast(core: Core, par: Parameters, dt: float) -> None:
     coast(core.P, dt, par.coast_accel, par.coast_rate)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Events, e: int, rate: Vector) -> None:
     """Apply or record event e at the state's time; rate: bias-free body rate, rad/s."""
     kind = ev.kind[e]
     if ev.verdict[e] >= 0:
         _record(rec, e, kind, 0, ev.verdict[e])
         return
-    propagate(core, par.noise)
+    propagate(core.nav, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
     if kind == OUTPUT:
         _record_state(core, rec, ev.t[e])
         return
@@ -191,9 +190,9 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
     _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector) -> int:
-    """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom (0: unobserved)."""
+    """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom."""
     nav, H, R = core.nav, core.H, core.R
     H[:] = 0.0
     r = attitude(nav)
@@ -216,7 +215,7 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
     return 3 if kind in (_GNSS_POSITION, _GNSS_VELOCITY) else 1
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int:
     """Pose fix in vehicle axes; directions that the histogram does not observe are dropped."""
     R, r = core.R, attitude(core.nav)
@@ -235,10 +234,10 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int
     trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
     if trace <= 1.0:  # then every eigenvalue is
         return 3
-    return observed_directions(core, limits)
+    return observed_directions(core.H, R, core.residual, limits)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accepted: int) -> None:
     """Gate the core's residual and correct the state; complete decision k."""
     L, residual = core.L, core.residual
@@ -257,28 +256,29 @@ def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accept
     rec.scores[k, 0] = score
     if not score <= threshold:
         return
-    correct(core, residual)
+    correct(core.nav, core.P, core.W, core.dx, residual)
+    refresh(core.nav, core.earth)
     dx = core.dx
     rec.reason[k] = accepted
     rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
     rec.scores[k, 3] = abs(dx[8])
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> int:
     """Open a decision; returns its row."""
-    k = rec.count[1]
-    rec.count[1] = k + 1
+    k = int(rec.filled[1])
+    rec.filled[1] = k + 1
     rec.event[k], rec.sensor[k], rec.dof[k], rec.reason[k] = event, sensor, dof, reason
     return k
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _record_state(core: Core, rec: Recorder, t: int) -> None:
     """Record nav, the pose covariance (position, attitude) and every sigma."""
     P = core.P
-    k = rec.count[0]
-    rec.count[0] = k + 1
+    k = rec.filled[0]
+    rec.filled[0] = k + 1
     rec.t[k] = t
     for i in range(16):
         rec.nav[k, i] = core.nav[i]

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.events import Measurements, Parameters
 from fusion.config import FusionConfig
+from fusion.events import Measurements, Parameters
 from fusion.result import Sensor
 from fusion.state import (
     E_ACCEL_BIAS,
@@ -238,7 +238,9 @@ class Aligner:
         earth = R.T @ np.array([0.0, EARTH_RATE * math.cos(lat), EARTH_RATE * math.sin(lat)])
         seconds = self.rest[1] * self.config.alignment.window_s
         white = self.par.noise.gyro_psd / seconds
-        return self.rest[0] / self.rest[1] - earth, math.sqrt(white + self.par.noise.gyro_bias_var + (5 * _DEG_PER_H) ** 2)
+        return self.rest[0] / self.rest[1] - earth, math.sqrt(
+            white + self.par.noise.gyro_bias_var + (5 * _DEG_PER_H) ** 2
+        )
 
 
 def _accel_bias_sigma(spec: ImuSpec) -> float:

@@ -1,7 +1,7 @@
 """Error covariance: the transition is integrated with every IMU step, P is propagated only when it is needed.
 
-Between two uses of P (a measurement, a recorded state) the transition Phi is accumulated from the velocity increments and
-the attitude, as in preintegration; P' = Phi P Phi' + Q costs one product per use instead of one per IMU sample.
+Between two uses of P (a measurement, a recorded state) the transition Phi is accumulated from the velocity increments
+and the attitude, as in preintegration; P' = Phi P Phi' + Q costs one product per use instead of one per IMU sample.
 """
 
 import math
@@ -11,11 +11,14 @@ from numba import njit
 
 from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
-from fusion.state import A_S, A_U, ROW, Core, Floats
+from fusion.state import A_S, A_U, ROW, Floats
+
+Scratch = tuple[Floats, Floats, Floats]
+"""phi (9, 16), M (9, 16) and Mt (15, 16) of the core."""
 
 
 class Noise(NamedTuple):
-    """Process noise per second: gyro (rad/s)^2/Hz, accelerometer (m/s^2)^2/Hz; variances and 1/tau of drifting biases."""
+    """Process noise: gyro (rad/s)^2/Hz, accelerometer (m/s^2)^2/Hz; variances and 1/tau (1/s) of the drifting biases."""
 
     gyro_psd: float
     accel_psd: float
@@ -85,13 +88,14 @@ def _product(phi: Floats, X: Floats, Y: Floats) -> None:
 
 
 @njit(cache=True)
-def propagate(core: Core, noise: Noise) -> None:
+def propagate(nav: Floats, P: Floats, acc: Floats, elapsed: Floats, scratch: Scratch, noise: Noise) -> None:
     """P = Phi P Phi' + Q over the accumulated span, which is then empty."""
-    span, P, M, Mt, acc = core.span[0], core.P, core.M, core.Mt, core.acc
+    span = elapsed[0]
     if span == 0.0:
         return
-    transition(core.nav, acc, span, core.phi)
-    _product(core.phi, P, M)
+    phi, M, Mt = scratch
+    transition(nav, acc, span, phi)
+    _product(phi, P, M)
     for k in range(15):
         for i in range(9):
             Mt[k, i] = M[i, k]
@@ -102,12 +106,12 @@ def propagate(core: Core, noise: Noise) -> None:
     for i in range(9, 15):
         for j in range(9, 15):
             P[i, j] *= decay * decay
-    _product(core.phi, Mt, M)
+    _product(phi, Mt, M)
     for i in range(9):
         for j in range(i + 1):
             P[i, j] = P[j, i] = M[i, j]
     _add_noise(P, acc, noise, span, 1.0 - decay * decay)
-    core.span[0] = 0.0
+    elapsed[0] = 0.0
     acc[:] = 0.0
 
 

@@ -1,4 +1,4 @@
-"""What the kernel reads and writes: parameters, measurement columns, events and recorded decisions (named tuples of arrays)."""
+"""What the kernel reads and writes: parameters, measurement columns, events and recorded decisions."""
 
 from typing import NamedTuple
 
@@ -76,13 +76,13 @@ class Events(NamedTuple):
 
 
 class Recorder(NamedTuple):
-    """Output arrays, filled from ``count`` = (states, decisions) on.
+    """Output arrays, filled from ``filled`` = (states, decisions) on.
 
     States: t (N,), nav (N, 16), pose_cov (N, 6, 6), sigma_state (N, 15). Decisions: event (M,) index of the event;
     sensor, reason, dof (M,) int8; innovation, sigma (M, 3); scores (M, 4): NIS, threshold, metres moved, yaw moved.
     """
 
-    count: NDArray[np.int64]
+    filled: NDArray[np.int64]
     t: NDArray[np.int64]
     nav: Floats
     pose_cov: Floats
@@ -99,7 +99,7 @@ class Recorder(NamedTuple):
 def new_recorder(states: int, decided: int) -> Recorder:
     """Empty output arrays for so many states and decisions."""
     return Recorder(
-        count=np.zeros(2, np.int64),
+        filled=np.zeros(2, np.int64),
         t=np.zeros(states, np.int64),
         nav=np.zeros((states, 16)),
         pose_cov=np.zeros((states, 6, 6)),

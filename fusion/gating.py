@@ -1,4 +1,4 @@
-"""Gates and the correction: covariance gate on a pose fix, chi-square gate on the innovation, Kalman update and reset."""
+"""Gates and the correction: covariance gate of a pose fix, chi-square gate on the innovation, update and reset."""
 
 import math
 
@@ -6,19 +6,18 @@ import numpy as np
 from numba import njit
 
 from fusion._linalg import Quaternion, Vector, exp_q, multiply, normalize
-from fusion.mechanization import refresh
-from fusion.state import ROW, Core, Floats
+from fusion.state import ROW, Floats
 from sensors._kernels import radii
 
 
 @njit(cache=True)
-def observed_directions(core: Core, limits: Vector) -> int:
-    """Reduce the core's residual, H and R (along, left, yaw) to the directions that a pose fix observes; return how many.
+def observed_directions(H: Floats, R: Floats, residual: Floats, limits: Vector) -> int:
+    """Reduce residual, H and R (along, left, yaw) to the directions that a pose fix observes; return how many.
 
-    Eigenvectors u of D^-1 R D^-1, D = diag(limits) (m, m, rad), with an eigenvalue of at most 1 are observed. The rows
-    become u' D^-1 of the old ones, so residuals are in units of the limits and R is diagonal. All three: nothing changes.
+    Eigenvectors u of D^-1 R D^-1, D = diag(limits) (m, m, rad), with an eigenvalue of at most 1 are observed.
+    The rows become u' D^-1 of the old ones, so residuals are in units of the limits and R is diagonal. Where all three
+    are observed nothing changes.
     """
-    H, R, residual = core.H, core.R, core.residual
     scaled = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -92,22 +91,20 @@ def whiten(dof: int, residual: Floats, L: Floats) -> float:
 
 
 @njit(cache=True, fastmath={"contract"})
-def correct(core: Core, white: Floats) -> None:
+def correct(nav: Floats, P: Floats, W: Floats, dx: Floats, white: Floats) -> None:
     """Kalman update after ``innovate`` and ``whiten``: dx = W' w, P -= W' W, then the error is moved into nav.
 
-    Resetting the attitude error turns its axes: P is mapped by G = I + [dtheta]x / 2 (left Jacobian of SO(3), Sola 2017,
-    Eq. 287 for a global error, to first order).
+    Resetting the attitude error turns its axes: P is mapped by G = I + [dtheta]x / 2, the left Jacobian of SO(3) to first
+    order (Sola 2017, sec. 6.3 and 7.3, for a global error).
     """
-    P, W, dx = core.P, core.W, core.dx
     for j in range(ROW):
         dx[j] = white[0] * W[0, j] + white[1] * W[1, j] + white[2] * W[2, j]
     for i in range(15):
         a, b, c = W[0, i], W[1, i], W[2, i]
         for j in range(ROW):
             P[i, j] -= a * W[0, j] + b * W[1, j] + c * W[2, j]
-    inject(core.nav, dx)
+    inject(nav, dx)
     reset(P, (0.5 * dx[6], 0.5 * dx[7], 0.5 * dx[8]))
-    refresh(core.nav, core.earth)
 
 
 @njit(cache=True)

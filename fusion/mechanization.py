@@ -55,8 +55,8 @@ def strapdown(nav: Floats, earth: Floats, turn: Vector, dv: Vector, dt: float) -
     """Advance nav (16,) in place by dt.
 
     turn: rotation vector of the body against inertial space, body axes; dv: specific force integrated, ENU axes at the
-    start. Second order in dt: Coriolis, transport and gravity at mid-step, position by the trapezoid of velocity. Latitude's
-    sine and cosine follow by first-order steps; radii wait for ``refresh``: over 0.1 s they change by 1e-8 of themselves.
+    start. Second order in dt: Coriolis, transport and gravity at mid-step, position by the trapezoid of velocity.
+    Latitude's sine and cosine follow by first-order steps; radii wait for ``refresh``: over 0.1 s they change by 1e-8.
     """
     if earth[G_AGE] > MAX_AGE_S:
         refresh(nav, earth)
@@ -95,8 +95,8 @@ def strapdown(nav: Floats, earth: Floats, turn: Vector, dv: Vector, dt: float) -
 def slow_dynamics(nav: Floats, F: Floats) -> None:
     """Write the slow 9x9 part of the error dynamics into F (9, 16): earth, transport and gravity terms, 1/s.
 
-    Left out here: position against velocity (identity) and everything that the IMU's samples enter, which ``covariance``
-    integrates step by step. The change of the radii of curvature with latitude (0.3 % of these terms) is neglected.
+    Left out here: position against velocity (identity) and all that the IMU's samples enter, which ``covariance`` sums
+    step by step. The change of the radii of curvature with latitude (0.3 % of these terms) is neglected.
     """
     ve, vn, vu = nav[3], nav[4], nav[5]
     sin_lat, cos_lat = math.sin(nav[0]), math.cos(nav[0])

@@ -8,17 +8,22 @@ from fusion.events import Parameters
 from fusion.gating import correct, innovate, whiten
 from fusion.measurements import body_velocity
 from fusion.result import Sensor
-from fusion.state import C_COUNT, C_TICK, RING_SIZE, Core
+from fusion.state import C_COUNT, C_TICK, RING_SIZE, Core, Floats, Nanoseconds
 from sensors._kernels import EARTH_RATE
 
 _ZERO_VELOCITY = int(Sensor.ZERO_VELOCITY)
 _NON_HOLONOMIC = int(Sensor.NON_HOLONOMIC)
 
+StillLimits = tuple[int, float, float]
+"""Window ns, variance of the specific force's norm (m/s^2)^2 and of each rate (rad/s)^2."""
+
 
 @njit(cache=True)
-def still(core: Core, par: Parameters, now: int) -> tuple[bool, float, float, float]:
+def still(
+    ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, limits: StillLimits, now: int
+) -> tuple[bool, float, float, float]:
     """Whether the IMU was quiet over the window before now, and its mean rate since the last motion tick, rad/s."""
-    count = core.clock[C_COUNT]
+    count = clock[C_COUNT]
     total = np.zeros(3)
     squares = np.zeros(3)
     recent = np.zeros(3)
@@ -27,32 +32,32 @@ def still(core: Core, par: Parameters, now: int) -> tuple[bool, float, float, fl
     oldest = now
     for back in range(min(count, RING_SIZE)):
         i = (count - 1 - back) % RING_SIZE
-        t = core.ring_t[i]
-        if t <= now - par.still_window_ns:
+        t = ring_t[i]
+        if t <= now - limits[0]:
             break
         oldest = t
         n += 1
         for k in range(3):
-            rate = core.ring[i, k] - core.nav[10 + k]
+            rate = ring[i, k] - nav[10 + k]
             total[k] += rate
             squares[k] += rate * rate
-        if t > core.clock[C_TICK]:
+        if t > clock[C_TICK]:
             fresh += 1
             for k in range(3):
-                recent[k] += core.ring[i, k]
-        f2 = core.ring[i, 3] ** 2 + core.ring[i, 4] ** 2 + core.ring[i, 5] ** 2
+                recent[k] += ring[i, k]
+        f2 = ring[i, 3] ** 2 + ring[i, 4] ** 2 + ring[i, 5] ** 2
         norm += np.sqrt(f2)
         norm2 += f2
-    if n < 5 or fresh == 0 or now - oldest < 0.8 * par.still_window_ns:
+    if n < 5 or fresh == 0 or now - oldest < 0.8 * limits[0]:
         return False, 0.0, 0.0, 0.0
-    quiet = norm2 / n - (norm / n) ** 2 < par.still_accel_var
+    quiet = norm2 / n - (norm / n) ** 2 < limits[1]
     for k in range(3):
         mean = total[k] / n
-        quiet = quiet and squares[k] / n - mean * mean < par.still_rate_var
+        quiet = quiet and squares[k] / n - mean * mean < limits[2]
     return quiet, recent[0] / fresh, recent[1] / fresh, recent[2] / fresh
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, int]:
     """Residual, H and R of what the motion allows: sensor and degrees of freedom, 0 for nothing.
 
@@ -62,7 +67,8 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     speed = np.sqrt(nav[3] ** 2 + nav[4] ** 2 + nav[5] ** 2)
     quiet = False
     if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4] + P[5, 5]):
-        quiet, w0, w1, w2 = still(core, par, now)
+        limits = (par.still_window_ns, par.still_accel_var, par.still_rate_var)
+        quiet, w0, w1, w2 = still(core.ring, core.ring_t, core.clock, nav, limits, now)
         if quiet:
             _zero_rate(core, par, (w0, w1, w2))
     core.clock[C_TICK] = now
@@ -85,7 +91,7 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     return _NON_HOLONOMIC, 2
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
     """At rest the gyro shows its bias and the earth's turning: mean = bg + R' omega_ie. Gated, not recorded on its own."""
     nav, R, residual = core.nav, core.R, core.residual
@@ -97,4 +103,4 @@ def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
         R[i, i] = par.zero_rate_var
         residual[i] = mean[i] - earth[i] - nav[10 + i]
     if innovate(core.P, core.H, core.W, 3, R, core.L) and whiten(3, residual, core.L) <= par.gate[2]:
-        correct(core, residual)
+        correct(nav, core.P, core.W, core.dx, residual)

@@ -40,6 +40,8 @@ class Reason(IntEnum):
     OUTSIDE_IMU = 7
     """No IMU samples at this time."""
     USED_FOR_ALIGNMENT = 8
+    LATE = 9
+    """Older than the state when it came (live use)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

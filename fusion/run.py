@@ -1,6 +1,7 @@
 """Batch run over a log: lay out the events, align, let the kernel go through them once."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,8 @@ from numpy.typing import NDArray
 from fusion._kernels import process
 from fusion.alignment import Aligner, Initial
 from fusion.config import FusionConfig
-from fusion.events import OUTPUT, Events, Recorder, new_recorder
+from fusion.events import OUTPUT, Recorder, new_recorder
+from fusion.mechanization import refresh
 from fusion.result import Decisions, FusionResult, Reason, States
 from fusion.state import (
     ACCEL_BIAS,
@@ -25,9 +27,11 @@ from fusion.state import (
     covariance,
     new_core,
 )
-from fusion.timeline import APPLY, Sources, merge, parameters, sources
+from fusion.timeline import APPLY, Sources, Timeline, merge, parameters, sources
 from sensors.errors import EgolocError
 from sensors.records import Imu, LeftOut, Log
+
+Columns = TypeVar("Columns", States, Decisions)
 
 
 def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
@@ -45,23 +49,22 @@ def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
     order = np.lexsort((found.kind, found.t_ns))
     initial = _align(log, config, found, order, imu)
     if initial is None:
-        states, applied = _states(new_recorder(0, 0)), None
-        decided = _unused(found, order, Reason.BEFORE_ALIGNMENT)
-        return FusionResult(states, decided, None)
+        return FusionResult(states(new_recorder(0, 0)), unused(found, order, Reason.BEFORE_ALIGNMENT), None)
     core = start(initial, imu)
     last = int(imu.t_ns[-1])
-    events, arrival = merge(found, initial.t_ns + 1, last, config, log.vehicle.land_vehicle)
+    timeline = merge(found, initial.t_ns + 1, last, config, log.vehicle.land_vehicle)
+    events = timeline.events
     outputs = int((events.kind == OUTPUT).sum())
     recorder = new_recorder(outputs, len(events.t) - outputs)
     first = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right"))
     process(core, imu.t_ns[first:], imu.gyro[first:], imu.accel[first:], events, 0, found.measurements, par, recorder)
-    applied = decisions(recorder, events, arrival)
+    applied = decisions(recorder, timeline)
     before = order[found.t_ns[order] <= initial.t_ns]
-    early = _unused(found, before, Reason.BEFORE_ALIGNMENT, initial)
-    late = _unused(found, order[found.t_ns[order] > last], Reason.OUTSIDE_IMU)
+    early = unused(found, before, Reason.BEFORE_ALIGNMENT, initial)
+    late = unused(found, order[found.t_ns[order] > last], Reason.OUTSIDE_IMU)
     gaps = int((np.diff(imu.t_ns) > config.imu.max_gap_s * 1e9).sum())
     notes = (LeftOut("imu", f"gap over {config.imu.max_gap_s:g} s, coasted", gaps),) if gaps else ()
-    return FusionResult(_states(recorder), _join((early, applied, late)), initial.t_ns, notes)
+    return FusionResult(states(recorder), join(Decisions, (early, applied, late)), initial.t_ns, notes)
 
 
 def _align(log: Log, config: FusionConfig, found: Sources, order: NDArray[np.int64], imu: Imu) -> Initial | None:
@@ -86,6 +89,7 @@ def start(initial: Initial, imu: Imu) -> Core:
     core.clock[C_TICK] = initial.t_ns
     core.nav[:] = initial.nav
     covariance(core)[:] = initial.P
+    refresh(core.nav, core.earth)
     core.last[0, :3], core.last[0, 3:] = imu.gyro[before], imu.accel[before]
     if before > 0:
         core.clock[C_INTERVAL] = imu.t_ns[before] - imu.t_ns[before - 1]
@@ -93,8 +97,9 @@ def start(initial: Initial, imu: Imu) -> Core:
     return core
 
 
-def _states(rec: Recorder) -> States:
-    n = int(rec.count[0])
+def states(rec: Recorder) -> States:
+    """The recorder's states."""
+    n = int(rec.filled[0])
     nav = rec.nav[:n]
     return States(
         rec.t[:n],
@@ -108,15 +113,15 @@ def _states(rec: Recorder) -> States:
     )
 
 
-def decisions(rec: Recorder, events: Events, arrival_ns: NDArray[np.int64]) -> Decisions:
-    """The recorder's decisions with the times and rows of their events."""
-    n = int(rec.count[1])
+def decisions(rec: Recorder, timeline: Timeline) -> Decisions:
+    """The recorder's decisions with the times and log rows of their events."""
+    n = int(rec.filled[1])
     event, scores = rec.event[:n], rec.scores[:n]
     return Decisions(
-        events.t[event],
-        arrival_ns[event],
+        timeline.events.t[event],
+        timeline.arrival_ns[event],
         rec.sensor[:n],
-        events.row[event],
+        timeline.log_row[event],
         rec.reason[:n],
         rec.innovation[:n],
         rec.sigma[:n],
@@ -128,7 +133,7 @@ def decisions(rec: Recorder, events: Events, arrival_ns: NDArray[np.int64]) -> D
     )
 
 
-def _unused(found: Sources, rows: NDArray[np.int64], reason: Reason, initial: Initial | None = None) -> Decisions:
+def unused(found: Sources, rows: NDArray[np.int64], reason: Reason, initial: Initial | None = None) -> Decisions:
     """Decisions for measurements that never reached the kernel; the one that completed alignment says so."""
     n = len(rows)
     nothing: Floats = np.full(n, np.nan)
@@ -140,7 +145,7 @@ def _unused(found: Sources, rows: NDArray[np.int64], reason: Reason, initial: In
         found.t_ns[rows],
         found.arrival_ns[rows],
         found.kind[rows],
-        found.row[rows],
+        found.log_row[rows],
         reasons,
         np.full((n, 3), np.nan),
         np.full((n, 3), np.nan),
@@ -152,6 +157,7 @@ def _unused(found: Sources, rows: NDArray[np.int64], reason: Reason, initial: In
     )
 
 
-def _join(parts: Sequence[Decisions]) -> Decisions:
-    names = Decisions.__dataclass_fields__
-    return Decisions(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+def join(kind: type[Columns], parts: Sequence[Columns]) -> Columns:
+    """Records one after the other."""
+    names = kind.__dataclass_fields__
+    return kind(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Nanoseconds = NDArray[np.int64]
 
 LLH = slice(0, 3)
 VELOCITY = slice(3, 6)
@@ -67,7 +68,7 @@ class Core(NamedTuple):
     phi, M (9, 16), Mt (15, 16), H, W (3, 16), R, L (3, 3), residual (3,), dx (16,): scratch.
     """
 
-    clock: NDArray[np.int64]
+    clock: Nanoseconds
     nav: Floats
     P: Floats
     last: Floats
@@ -75,7 +76,7 @@ class Core(NamedTuple):
     acc: Floats
     earth: Floats
     ring: Floats
-    ring_t: NDArray[np.int64]
+    ring_t: Nanoseconds
     phi: Floats
     M: Floats
     Mt: Floats

@@ -3,23 +3,26 @@
 Ordering lives here, outside the core: measurements are laid out by the time at which they were true.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters
 from fusion.config import FusionConfig
 from fusion.covariance import Noise
+from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters
 from fusion.result import Reason, Sensor
 from fusion.state import Floats
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame, llh_from_map, rotation_map_enu
-from sensors.records import GnssFix, GnssStatus, GnssVelocity, Log, PoseFix, WheelSpeed
+from sensors.records import GnssFix, GnssStatus, GnssVelocity, Log, PoseFix
 from sensors.vehicle import ImuSpec, Vehicle
 
 APPLY = -1
+Rows = NDArray[np.int64]
+Verdict = NDArray[np.int8]
 STANDARD_GRAVITY = 9.80665
 
 _ROOT_HOUR = 60.0
@@ -83,14 +86,58 @@ def _vector(given: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 class Sources(NamedTuple):
-    """Measurements with the columns that events need: (t_ns true time, arrival_ns, sensor, row, verdict) per sensor."""
+    """Measurements, and for each of them (M,): t_ns true time, arrival_ns, kind (Sensor), row into its columns,
+    log_row into the log's record, verdict (APPLY or the Reason that is only recorded)."""
 
     measurements: Measurements
     t_ns: NDArray[np.int64]
     arrival_ns: NDArray[np.int64]
     kind: NDArray[np.int8]
     row: NDArray[np.int64]
+    log_row: NDArray[np.int64]
     verdict: NDArray[np.int8]
+
+    def at(self, i: int, first_log_row: int) -> "Sources":
+        """Measurement i alone; its record's first row is first_log_row of the log."""
+        wanted, row = _GROUP[int(self.kind[i])], int(self.row[i])
+        columns = [
+            column[row : row + 1] if group == wanted else column[:0]
+            for group, column in zip(_GROUPS, self.measurements, strict=True)
+        ]
+        one = slice(i, i + 1)
+        return Sources(
+            Measurements(*columns),
+            self.t_ns[one],
+            self.arrival_ns[one],
+            self.kind[one],
+            np.zeros(1, np.int64),
+            self.log_row[one] + first_log_row,
+            self.verdict[one],
+        )
+
+
+_GROUPS = ("gnss", "gnss", "vel", "vel", "gnss", "gnss", "pose", "pose", "pose", "pose", "wheel", "wheel")
+"""Which record each column of Measurements belongs to."""
+_GROUP = {
+    int(Sensor.GNSS_POSITION): "gnss",
+    int(Sensor.GNSS_YAW): "gnss",
+    int(Sensor.GNSS_VELOCITY): "vel",
+    int(Sensor.POSE_FIX): "pose",
+    int(Sensor.WHEEL): "wheel",
+}
+
+
+def concatenate(parts: Sequence[Sources]) -> Sources:
+    """Sources of one measurement each (``Sources.at``) as one."""
+    columns = [np.concatenate(column) for column in zip(*(part.measurements for part in parts), strict=True)]
+    seen = dict.fromkeys(_GROUPS, 0)
+    rows = np.empty(len(parts), np.int64)
+    for i, part in enumerate(parts):
+        group = _GROUP[int(part.kind[0])]
+        rows[i] = seen[group]
+        seen[group] += 1
+    t, arrival, kind, _, log_row, verdict = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])
+    return Sources(Measurements(*columns), t, arrival, kind, rows, log_row, verdict)
 
 
 def sources(log: Log, config: FusionConfig) -> Sources:
@@ -99,10 +146,10 @@ def sources(log: Log, config: FusionConfig) -> Sources:
     Raises EgolocError when the log holds pose fixes but no map frame to place them.
     """
     vehicle = log.vehicle
-    columns: list[tuple[NDArray[np.int64], NDArray[np.int64], Sensor, NDArray[np.int64], NDArray[np.int8]]] = []
+    columns: list[tuple[Rows, Rows, Sensor, Rows, Verdict]] = []
 
-    def add(sensor: Sensor, t: NDArray[np.int64], arrival: NDArray[np.int64], rows: Floats, verdict: Floats) -> None:
-        columns.append((t, arrival, sensor, np.asarray(rows, np.int64), np.asarray(verdict, np.int8)))
+    def add(sensor: Sensor, t: Rows, arrival: Rows, rows: Rows, verdict: Verdict) -> None:
+        columns.append((t, arrival, sensor, rows, verdict))
 
     empty = np.empty((0, 3))
     llh, gnss_cov, yaw, yaw_var = empty, np.empty((0, 3, 3)), np.empty(0), np.empty(0)
@@ -122,7 +169,9 @@ def sources(log: Log, config: FusionConfig) -> Sources:
     pose = (empty, np.empty(0), np.empty((0, 2)), np.empty((0, 3, 3)))
     if log.pose_fixes is not None:
         if log.map_frame is None:
-            raise EgolocError("the log has pose fixes but no map frame: expected [map_frame] in its metadata or the config")
+            raise EgolocError(
+                "the log has pose fixes but no map frame: expected [map_frame] in its metadata or the config"
+            )
         pose = pose_columns(log.pose_fixes, log.map_frame, config)
         t = log.pose_fixes.t_ns
         add(Sensor.POSE_FIX, t, log.pose_fixes.arrival_ns, np.arange(len(t)), _switch(config.pose.use, len(t)))
@@ -137,12 +186,13 @@ def sources(log: Log, config: FusionConfig) -> Sources:
         np.concatenate([np.empty(0, np.int64), *(c[0] for c in columns)]),
         np.concatenate([np.empty(0, np.int64), *(c[1] for c in columns)]),
         np.concatenate([np.empty(0, np.int8), *(np.full(len(c[0]), c[2], np.int8) for c in columns)]),
-        np.concatenate([np.empty(0, np.int64), *(c[3] for c in columns)]),
+        rows := np.concatenate([np.empty(0, np.int64), *(c[3] for c in columns)]),
+        rows,
         np.concatenate([np.empty(0, np.int8), *(c[4] for c in columns)]),
     )
 
 
-def _switch(on: bool, n: int) -> NDArray[np.int8]:
+def _switch(on: bool, n: int) -> Verdict:
     return np.full(n, APPLY if on else Reason.SWITCHED_OFF, np.int8)
 
 
@@ -153,7 +203,7 @@ def _gnss_verdict(fixes: GnssFix, config: FusionConfig) -> NDArray[np.int8]:
 
 
 def _gnss_columns(fixes: GnssFix, vehicle: Vehicle, config: FusionConfig) -> tuple[Floats, Floats, Floats, Floats]:
-    """llh, effective ENU covariance, yaw and its effective variance: inflation, then floors, then the lever arm's sigma."""
+    """llh, effective ENU covariance, yaw and its effective variance: inflation, floors, lever arm."""
     model = config.gnss
     floors = np.array([model.sigma_floor_horizontal_m] * 2 + [model.sigma_floor_vertical_m]) ** 2
     cov = _floor(fixes.cov_enu * model.inflation, floors)
@@ -178,8 +228,8 @@ def _floor(cov: Floats, variances: Floats) -> Floats:
 def pose_columns(fixes: PoseFix, frame: MapFrame, config: FusionConfig) -> tuple[Floats, Floats, Floats, Floats]:
     """Pose fixes in geodetic terms: llh on the map's ground (N, 3), yaw from east (N,), tilt (N, 2), cov ENU (N, 3, 3).
 
-    The map is linearized at each fix: (x, y) = scale R_map_enu[:2] (offset ENU). tilt is what a metre of height moves the
-    point horizontally in ENU (zero in UTM; in one ENU plane the verticals differ with distance).
+    The map is linearized at each fix: (x, y) = scale R_map_enu[:2] (offset ENU). tilt is what a metre of height moves
+    the point horizontally in ENU (zero in UTM; in one ENU plane the verticals differ with distance).
     """
     model = config.pose
     n = len(fixes)
@@ -207,8 +257,16 @@ def grid(first_ns: int, last_ns: int, rate_hz: float) -> NDArray[np.int64]:
     return np.arange(start, last_ns // period + 1, dtype=np.int64) * period
 
 
-def merge(found: Sources, first_ns: int, last_ns: int, config: FusionConfig, land_vehicle: bool) -> tuple[Events, NDArray[np.int64]]:
-    """Sorted events in (first, last] with motion ticks and outputs, and each one's arrival (its own time for the latter).
+class Timeline(NamedTuple):
+    """Events in order, and for each its arrival and its row in the log's record (-1: none)."""
+
+    events: Events
+    arrival_ns: NDArray[np.int64]
+    log_row: NDArray[np.int64]
+
+
+def merge(found: Sources, first_ns: int, last_ns: int, config: FusionConfig, land_vehicle: bool) -> Timeline:
+    """All measurements in [first, last] with motion ticks and outputs, sorted.
 
     At equal times sensors come in the order of ``Sensor``, then motion, then output.
     """
@@ -216,12 +274,17 @@ def merge(found: Sources, first_ns: int, last_ns: int, config: FusionConfig, lan
     outputs = grid(first_ns, last_ns, config.output_hz)
     motion = config.motion
     wanted = land_vehicle and (motion.zero_velocity or motion.non_holonomic)
-    ticks = grid(first_ns + 1, last_ns, motion.rate_hz) if wanted else np.empty(0, np.int64)
-    t = np.concatenate((found.t_ns[inside], ticks, outputs))
-    arrival = np.concatenate((found.arrival_ns[inside], ticks, outputs))
+    ticks = grid(first_ns, last_ns, motion.rate_hz) if wanted else np.empty(0, np.int64)
     made = np.concatenate((np.full(len(ticks), MOTION, np.int8), np.full(len(outputs), OUTPUT, np.int8)))
+    none = np.full(len(made), -1)
+    t = np.concatenate((found.t_ns[inside], ticks, outputs))
     kind = np.concatenate((found.kind[inside], made))
-    row = np.concatenate((found.row[inside], np.full(len(made), -1)))
-    verdict = np.concatenate((found.verdict[inside], np.full(len(made), APPLY, np.int8)))
     order = np.lexsort((kind, t))
-    return Events(t[order], kind[order], row[order], verdict[order]), arrival[order]
+    events = Events(
+        t[order],
+        kind[order],
+        np.concatenate((found.row[inside], none))[order],
+        np.concatenate((found.verdict[inside], np.full(len(made), APPLY, np.int8)))[order],
+    )
+    arrival = np.concatenate((found.arrival_ns[inside], ticks, outputs))[order]
+    return Timeline(events, arrival, np.concatenate((found.log_row[inside], none))[order])
