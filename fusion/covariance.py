@@ -18,7 +18,7 @@ Scratch = tuple[Floats, Floats, Floats]
 
 
 class Noise(NamedTuple):
-    """Process noise: gyro (rad/s)^2/Hz, accelerometer (m/s^2)^2/Hz; variances and 1/tau (1/s) of the drifting biases."""
+    """Process noise: gyro (rad/s)^2/Hz, accelerometer (m/s^2)^2/Hz; variances and 1/tau (1/s) of drifting biases."""
 
     gyro_psd: float
     accel_psd: float

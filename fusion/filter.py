@@ -8,12 +8,11 @@ import heapq
 
 import numpy as np
 
-from fusion._kernels import process
 from fusion.alignment import Aligner, Initial
 from fusion.config import FusionConfig
 from fusion.events import OUTPUT, new_recorder
 from fusion.result import Decisions, Reason, States
-from fusion.run import decisions, join, start, states, unused
+from fusion.run import decisions, feed, join, start, states, unused
 from fusion.state import Core, Floats, covariance
 from fusion.timeline import APPLY, Sources, concatenate, merge, parameters, sources
 from sensors.errors import EgolocError
@@ -97,8 +96,10 @@ class Localizer:
         )
 
     def _push_imu(self, record: Imu) -> None:
+        if not len(record):
+            return
         last = self._imu.t_ns[-1] if self._imu is not None else None
-        if last is not None and len(record) and record.t_ns[0] <= last:
+        if last is not None and record.t_ns[0] <= last:
             raise EgolocError(f"Imu.t_ns: expected increasing stamps, got {record.t_ns[0]} after {last}")
         if self.core is None:
             self._imu = record if self._imu is None else _append(self._imu, record)
@@ -150,7 +151,7 @@ class Localizer:
         events = timeline.events
         outputs = int((events.kind == OUTPUT).sum())
         recorder = new_recorder(outputs, len(events.t) - outputs)
-        process(core, imu.t_ns, imu.gyro, imu.accel, events, 0, found.measurements, self._par, recorder)
+        feed(core, imu, events, found.measurements, self._par, recorder)
         if outputs:
             self._states.append(states(recorder))
         if recorder.filled[1]:

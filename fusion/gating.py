@@ -94,8 +94,8 @@ def whiten(dof: int, residual: Floats, L: Floats) -> float:
 def correct(nav: Floats, P: Floats, W: Floats, dx: Floats, white: Floats) -> None:
     """Kalman update after ``innovate`` and ``whiten``: dx = W' w, P -= W' W, then the error is moved into nav.
 
-    Resetting the attitude error turns its axes: P is mapped by G = I + [dtheta]x / 2, the left Jacobian of SO(3) to first
-    order (Sola 2017, sec. 6.3 and 7.3, for a global error).
+    Resetting the attitude error turns its axes: P is mapped by G = I + [dtheta]x / 2, the left Jacobian of SO(3) to
+    first order (Sola 2017, sec. 6.3 and 7.3, for a global error).
     """
     for j in range(ROW):
         dx[j] = white[0] * W[0, j] + white[1] * W[1, j] + white[2] * W[2, j]

@@ -1,8 +1,8 @@
 """Measurement models: residual and Jacobian of each sensor, written into H (3, 15); residuals are returned.
 
 Each function gives measured minus predicted (three numbers) and fills the rows of H that it uses; columns that a sensor
-does not see stay zero. Attitude error is on the left in ENU, so ``d(R l) = -[R l]x dtheta``; a gyro bias error lowers the
-true rate, so ``d(omega) = -dbg``.
+does not see stay zero. Attitude error is on the left in ENU, so ``d(R l) = -[R l]x dtheta``; a gyro bias error lowers
+the true rate, so ``d(omega) = -dbg``.
 """
 
 import math

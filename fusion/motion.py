@@ -61,7 +61,8 @@ def still(
 def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, int]:
     """Residual, H and R of what the motion allows: sensor and degrees of freedom, 0 for nothing.
 
-    Zero velocity at rest (with the gyro's bias from its mean rate); else no lateral and vertical velocity of the rear axle.
+    Zero velocity at rest (with the gyro's bias from its mean rate); else no lateral and vertical velocity of the rear
+    axle.
     """
     nav, P, R, residual = core.nav, core.P, core.R, core.residual
     speed = np.sqrt(nav[3] ** 2 + nav[4] ** 2 + nav[5] ** 2)
@@ -93,7 +94,7 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
 
 @njit(cache=True, inline="always")
 def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
-    """At rest the gyro shows its bias and the earth's turning: mean = bg + R' omega_ie. Gated, not recorded on its own."""
+    """At rest the gyro shows its bias and the earth's turning: mean = bg + R' omega_ie. Gated, but not recorded."""
     nav, R, residual = core.nav, core.R, core.residual
     earth = matvec_t(attitude(nav), (0.0, EARTH_RATE * np.cos(nav[0]), EARTH_RATE * np.sin(nav[0])))
     R[:] = 0.0

@@ -49,8 +49,8 @@ class States:
     """States at t_ns (N,), each after all measurements up to and including its time.
 
     llh (N, 3); vel_enu (N, 3) m/s; q_enu_body (N, 4) xyzw; gyro_bias (N, 3) rad/s; accel_bias (N, 3) m/s^2;
-    pose_cov (N, 6, 6): position ENU m, attitude (left error, ENU) rad; sigma (N, 15): standard deviation of the whole error
-    state: position ENU m, velocity ENU m/s, attitude rad, gyro bias rad/s, accelerometer bias m/s^2.
+    pose_cov (N, 6, 6): position ENU m, attitude (left error, ENU) rad; sigma (N, 15): standard deviation of the whole
+    error state: position ENU m, velocity ENU m/s, attitude rad, gyro bias rad/s, accelerometer bias m/s^2.
     """
 
     t_ns: NDArray[np.int64]
@@ -70,11 +70,11 @@ class States:
 class Decisions:
     """One row per measurement, in the order of application.
 
-    t_ns (M,) when it was applied (its stamp minus the vehicle's delay), arrival_ns (M,); sensor, reason (M,) int8 (Sensor,
-    Reason); row (M,) index into the log's record (-1: none); innovation, innovation_sigma (M, 3), NaN where unused: GNSS in
-    ENU; pose fix along and left of the estimated heading m, yaw rad (partly accepted: the kept directions, in sigmas of
-    the gate); wheel forward, non-holonomic lateral and vertical m/s; nis, threshold (M,), dof (M,) int8;
-    moved_m, moved_yaw (M,): how far the update moved position (m) and yaw (rad).
+    t_ns (M,) when it was applied (its stamp minus the vehicle's delay), arrival_ns (M,); sensor, reason (M,) int8
+    (Sensor, Reason); row (M,) index into the log's record (-1: none); innovation, innovation_sigma (M, 3), NaN where
+    unused: GNSS in ENU; pose fix along and left of the estimated heading m, yaw rad (partly accepted: the kept
+    directions, in sigmas of the gate); wheel forward, non-holonomic lateral and vertical m/s; nis, threshold (M,),
+    dof (M,) int8; moved_m, moved_yaw (M,): how far the update moved position (m) and yaw (rad).
     """
 
     t_ns: NDArray[np.int64]

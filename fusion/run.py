@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fusion._kernels import process
 from fusion.alignment import Aligner, Initial
 from fusion.config import FusionConfig
-from fusion.events import OUTPUT, Recorder, new_recorder
+from fusion.events import OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
 from fusion.mechanization import refresh
 from fusion.result import Decisions, FusionResult, Reason, States
 from fusion.state import (
@@ -32,6 +32,7 @@ from sensors.errors import EgolocError
 from sensors.records import Imu, LeftOut, Log
 
 Columns = TypeVar("Columns", States, Decisions)
+Scalar = TypeVar("Scalar", np.int64, np.float64)
 
 
 def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
@@ -57,7 +58,7 @@ def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
     outputs = int((events.kind == OUTPUT).sum())
     recorder = new_recorder(outputs, len(events.t) - outputs)
     first = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right"))
-    process(core, imu.t_ns[first:], imu.gyro[first:], imu.accel[first:], events, 0, found.measurements, par, recorder)
+    feed(core, imu[first:], events, found.measurements, par, recorder)
     applied = decisions(recorder, timeline)
     before = order[found.t_ns[order] <= initial.t_ns]
     early = unused(found, before, Reason.BEFORE_ALIGNMENT, initial)
@@ -95,6 +96,21 @@ def start(initial: Initial, imu: Imu) -> Core:
         core.clock[C_INTERVAL] = imu.t_ns[before] - imu.t_ns[before - 1]
         core.last[1, :3], core.last[1, 3:] = imu.gyro[before - 1], imu.accel[before - 1]
     return core
+
+
+def feed(core: Core, imu: Imu, events: Events, measurements: Measurements, par: Parameters, rec: Recorder) -> None:
+    """Run the kernel over an IMU record and all events up to its last sample.
+
+    Every column goes in read-only and contiguous: one compiled kernel serves every log, whatever its sensors.
+    """
+    columns = Measurements(*(_read_only(column) for column in measurements))
+    process(core, _read_only(imu.t_ns), _read_only(imu.gyro), _read_only(imu.accel), events, 0, columns, par, rec)
+
+
+def _read_only(column: NDArray[Scalar]) -> NDArray[Scalar]:
+    view = np.ascontiguousarray(column).view()
+    view.flags.writeable = False
+    return view
 
 
 def states(rec: Recorder) -> States:

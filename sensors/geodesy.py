@@ -60,7 +60,7 @@ def ecef_from_llh(llh: ArrayLike) -> Floats:
 def llh_from_ecef(ecef: ArrayLike) -> Floats:
     """(N, 3) geodetic coordinates of (N, 3) ECEF, m."""
     x, y, z = np.asarray(ecef, np.float64).T
-    return np.stack(pymap3d.ecef2geodetic(x, y, z, deg=False), axis=-1)
+    return _rows(pymap3d.ecef2geodetic(x, y, z, deg=False))
 
 
 def enu_from_llh(llh: ArrayLike, datum: ArrayLike) -> Floats:
@@ -74,7 +74,7 @@ def llh_from_enu(enu: ArrayLike, datum: ArrayLike) -> Floats:
     """(N, 3) geodetic coordinates of (N, 3) in the plane tangent at datum (3,) llh."""
     east, north, up = np.asarray(enu, np.float64).T
     lat0, lon0, h0 = np.asarray(datum, np.float64)
-    return np.stack(pymap3d.enu2geodetic(east, north, up, lat0, lon0, h0, deg=False), axis=-1)
+    return _rows(pymap3d.enu2geodetic(east, north, up, lat0, lon0, h0, deg=False))
 
 
 def rotation_ecef_enu(llh: ArrayLike) -> Floats:
@@ -140,6 +140,11 @@ def transverse_radius(lat: ArrayLike) -> Floats:
     """(N,) radius of curvature of the prime vertical, m."""
     result: Floats = np.asarray(pymap3d.rcurve.transverse(np.asarray(lat, np.float64), deg=False))
     return result
+
+
+def _rows(columns: tuple[Any, Any, Any]) -> Floats:
+    """(N, 3) of three columns; of a single point pymap3d gives the latitude without its axis."""
+    return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
 
 def _datum(frame: MapFrame) -> tuple[float, float, float]:

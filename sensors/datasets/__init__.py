@@ -1,0 +1,34 @@
+"""Importers: real recordings and vendor formats become a ``Log``. One file a format, imported when it is asked for."""
+
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+
+from sensors.errors import EgolocError
+from sensors.records import Log
+
+FORMATS = {
+    "rtklib": "RTKLIB solution (.pos) with an IMU .csv and its .tag",
+    "imu-gnss-drive": "folder of imu.csv.gz, gnss.csv.gz and reference_*.csv.gz",
+    "comma2k19": "segment folder with processed_log/ and global_pose/",
+    "rosbag": "ROS 1 bag, or ROS 2 bag folder",
+    "novatel": "NovAtel OEM7 ASCII log",
+}
+"""Name of each format and what SRC is."""
+
+
+def load(format: str, src: Path, topics: Mapping[str, str] | None = None) -> Log:
+    """Log of a recording. topics (rosbag only): sensor (imu, gnss, ...) -> topic, where a bag has two for a sensor."""
+    if format not in FORMATS:
+        raise EgolocError(f"format {format}: expected one of {', '.join(FORMATS)}")
+    src = Path(src)
+    if not src.exists():
+        raise EgolocError(f"{src}: no such file or folder")
+    module = import_module(f"sensors.datasets.{format.replace('-', '_')}")
+    if format == "rosbag":
+        log: Log = module.load(src, topics)
+        return log
+    if topics:
+        raise EgolocError(f"format {format}: topics: only rosbag has topics")
+    loaded: Log = module.load(src)
+    return loaded

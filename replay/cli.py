@@ -1,0 +1,62 @@
+"""The command line: `egoloc COMMAND --help`. Heavy imports stand inside the commands."""
+
+import os
+import sys
+from collections.abc import Sequence
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any
+
+import tyro
+
+from replay.commands.logs import Convert, Info, Simulate
+from replay.commands.looking import Bench, View
+from replay.commands.replaying import Demo, Replay, Score
+from sensors.errors import EgolocError
+
+COMMANDS = {
+    "demo": Demo,
+    "convert": Convert,
+    "simulate": Simulate,
+    "info": Info,
+    "replay": Replay,
+    "score": Score,
+    "view": View,
+    "bench": Bench,
+}
+DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0 done, 2 a user's mistake (one line on standard error)."""
+    given = tuple(sys.argv[1:] if arguments is None else arguments)
+    choices: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
+    command = tyro.cli(
+        choices,
+        prog="egoloc",
+        description=DESCRIPTION,
+        args=given,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    try:
+        command.run(("egoloc", *given))
+    except EgolocError as error:
+        return _fail(str(error))
+    except BrokenPipeError:  # the reader of our output has gone: not an error, and nothing more to say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except KeyboardInterrupt:
+        print("egoloc: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _fail(message: str) -> int:
+    print(f"egoloc: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

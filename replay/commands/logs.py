@@ -1,0 +1,120 @@
+"""egoloc convert, simulate and info: making logs and looking into them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from replay.commands.output import print_json, stage
+from sensors.errors import EgolocError
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Turn a recorded drive of another format into an MCAP log with ROS 2 messages."""
+
+    format: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FORMAT")]
+    """rtklib, imu-gnss-drive, comma2k19, novatel or rosbag."""
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SRC")]
+    """The file or folder to read."""
+    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
+    """The log to write; it must not exist yet."""
+    reference: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A trajectory that becomes the log's reference: TUM, CSV with named columns, or Applanix."""
+    overwrite: bool = False
+    """Replace DEST.mcap."""
+    json: bool = False
+    """Print what was read as JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Read, write, and say what was read."""
+        from replay.inventory import inventory, print_inventory
+        from sensors.datasets import load
+        from sensors.mcap.io import write_log
+
+        _check_new(self.log, overwrite=self.overwrite)
+        with stage(f"reading {self.source}"):
+            log = load(self.format, self.source)
+            if self.reference is not None:
+                from replay.harness import with_reference
+
+                log = with_reference(log, self.reference, log.map_frame)
+        with stage(f"writing {self.log}"):
+            write_log(self.log, log)
+        found = inventory(log, str(self.log))
+        if self.json:
+            print_json(found)
+        else:
+            print_inventory(found)
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Write a simulated drive as an MCAP log."""
+
+    scenario: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENARIO")]
+    """A scenario of the package (demo, clean) or a TOML file with one."""
+    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
+    """The log to write; it must not exist yet."""
+    seed: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Seed of everything random; default: the scenario's."""
+    duration_s: Annotated[float | None, tyro.conf.arg(metavar="S")] = None
+    """Length of the drive, s; default: the scenario's."""
+    overwrite: bool = False
+    """Replace DEST.mcap."""
+    json: bool = False
+    """Print what was written as JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Simulate, write, and say what was written."""
+        from replay.inventory import inventory, print_inventory
+        from sensors.mcap.io import write_log
+        from sensors.simulate.drive import simulate
+        from sensors.simulate.scenarios import load
+
+        _check_new(self.log, overwrite=self.overwrite)
+        scenario = load(self.scenario)
+        duration_s = scenario.duration_s if self.duration_s is None else self.duration_s
+        seed = scenario.seed if self.seed is None else self.seed
+        with stage(f"simulating {duration_s:g} s of driving"):
+            log = simulate(duration_s, seed, scenario)
+        with stage(f"writing {self.log}"):
+            write_log(self.log, log)
+        found = inventory(log, str(self.log))
+        if self.json:
+            print_json(found)
+        else:
+            print_inventory(found)
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what is in an MCAP log, and what a replay would use of it."""
+
+    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
+    """The log."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
+    """A config whose [topics] choose between topics."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Describe the file, then what its sensors yield."""
+        from replay.config import RunConfig, load_config
+        from replay.inventory import file_inventory, print_inventory
+
+        config = RunConfig() if self.config is None else load_config(self.config)
+        with stage(f"reading {self.log}"):
+            found = file_inventory(self.log, config.topics)
+        if self.json:
+            print_json(found)
+        else:
+            print_inventory(found)
+
+
+def _check_new(path: Path, *, overwrite: bool) -> None:
+    if path.exists() and not (overwrite and path.is_file()):
+        raise EgolocError(
+            f"{path}: exists already: choose another name" + ("" if path.is_dir() else " or add --overwrite")
+        )

@@ -1,0 +1,58 @@
+"""egoloc view and bench."""
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from replay.commands.output import print_json, stage
+
+
+@dataclass(frozen=True)
+class View:
+    """Show a run, or two runs on one timeline, in rerun.
+
+    Writes RUN/run.rrd, or of two runs RUN_and_RUN_B.rrd beside RUN.
+    """
+
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    other: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RUN_B")] = None
+    """A second run of the same log, to compare by eye."""
+    rrd: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    """Where to write the recording instead."""
+    no_open: bool = False
+    """Only write the recording."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Write the recording and open it where there is a display."""
+        from replay.viewer import open_viewer, write_recording
+
+        with stage("drawing"):
+            rrd = write_recording(self.folder, self.rrd, self.other)
+        print(f"Recording: {rrd}")
+        if not self.no_open and not open_viewer(rrd):
+            print(f"No display here. On a machine with one: rerun {rrd}")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure speed side by side with other libraries, in one run on one core."""
+
+    name: tyro.conf.Positional[Literal["filter", "replay", "mcap"]]
+    """filter: IMU steps/s of the filter; replay: an hour of log to metrics.json; mcap: IMU messages/s read."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run one benchmark."""
+        with stage(f"benchmark {self.name}"):
+            result = import_module(f"replay.bench.{self.name}").run()
+        if self.json:
+            print_json(result)
+            return
+        from replay.table import bench_table, output_console
+
+        output_console().print(bench_table(result))
