@@ -197,7 +197,8 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
     H[:] = 0.0
     r = attitude(nav)
     if kind == _POSE_FIX:
-        return _measure_pose(core, par, m, row)
+        dof: int = _measure_pose(core, par, m, row)
+        return dof
     if kind == _GNSS_POSITION:
         R[:] = m.gnss_cov[row]
         z = gnss_position(nav, r, H, m.gnss_llh[row], par.gnss_arm)
@@ -234,7 +235,8 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int
     trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
     if trace <= 1.0:  # then every eigenvalue is
         return 3
-    return observed_directions(core.H, R, core.residual, limits)
+    kept: int = observed_directions(core.H, R, core.residual, limits)
+    return kept
 
 
 @njit(cache=True, inline="always")

@@ -44,8 +44,8 @@ class PoseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     use: bool = True
     """Apply pose fixes at all."""
-    inflation: float = 1.0
-    """The fix's covariance is multiplied by this, -."""
+    inflation: float = 4.0
+    """The fix's covariance is multiplied by this: errors of map and features last over many frames, -."""
     sigma_floor_m: float = 0.02
     """Smallest sigma along any direction of the plane, m."""
     sigma_floor_yaw_deg: float = 0.05

@@ -27,7 +27,7 @@ class Noise(NamedTuple):
     bias_rate: float
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, dt: float) -> None:
     """Add one IMU step to the transition: r is R_enu_body at its start, dv its velocity increment (m/s, ENU).
 

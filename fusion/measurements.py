@@ -14,7 +14,7 @@ from fusion.state import Floats
 from sensors._kernels import EARTH_RATE, radii
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _minus_skew(H: Floats, row: int, column: int, v: Vector) -> None:
     """Write -[v]x at (row, column)."""
     H[row, column + 1], H[row, column + 2] = v[2], -v[1]
@@ -22,7 +22,7 @@ def _minus_skew(H: Floats, row: int, column: int, v: Vector) -> None:
     H[row + 2, column], H[row + 2, column + 1] = v[1], -v[0]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def offset_enu(nav: Floats, lat: float, lon: float, height: float) -> Vector:
     """The state's position seen from a point nearby, ENU m (to first order, as the error state is)."""
     meridian, transverse = radii(math.sin(lat))
@@ -66,7 +66,7 @@ def gnss_velocity(nav: Floats, r: Matrix, H: Floats, vel: Floats, arm: Vector, r
     )
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def yaw_row(r: Matrix, H: Floats, row: int) -> float:
     """Yaw of the body (ccw from east) and its Jacobian against the attitude error."""
     horizontal = r[0] * r[0] + r[3] * r[3]
@@ -76,7 +76,7 @@ def yaw_row(r: Matrix, H: Floats, row: int) -> float:
     return math.atan2(r[3], r[0])
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def wrap(angle: float) -> float:
     """Angle in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

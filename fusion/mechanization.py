@@ -24,7 +24,7 @@ GRAVITY_GRADIENT = 3.086e-6
 """Fall of gravity with height, 1/s^2 (free air)."""
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def increments(w0: Vector, w1: Vector, f0: Vector, f1: Vector, dt: float) -> tuple[Vector, Vector]:
     """Rotation vector and velocity increment (axes at the start) over dt, rates and forces linear in between.
 
@@ -50,7 +50,7 @@ def refresh(nav: Floats, earth: Floats) -> None:
     earth[G_AGE] = 0.0
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def strapdown(nav: Floats, earth: Floats, turn: Vector, dv: Vector, dt: float) -> None:
     """Advance nav (16,) in place by dt.
 

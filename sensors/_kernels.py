@@ -19,7 +19,7 @@ _M = 0.003449786506841
 """omega^2 a^2 b / GM."""
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def radii(sin_lat: float) -> tuple[float, float]:
     """Meridian and transverse (prime vertical) radii of curvature, m."""
     w2 = 1.0 - WGS84_E2 * sin_lat * sin_lat
@@ -27,7 +27,7 @@ def radii(sin_lat: float) -> tuple[float, float]:
     return transverse * (1.0 - WGS84_E2) / w2, transverse
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def gravity_enu(sin_lat: float, cos_lat: float, height: float) -> tuple[float, float]:
     """North and up components of plumb-line gravity, m/s^2; east is zero.
 

@@ -14,14 +14,16 @@ from .conftest import Drive, records, synthetic_drive
 
 
 @pytest.mark.parametrize("late_s", [-0.31, 0.0, 0.26])
-def test_the_delay_of_positions_is_found_to_five_milliseconds(late_s: float) -> None:
-    drive = synthetic_drive(90.0, late_s=late_s)
+@pytest.mark.parametrize(("noise", "bound"), [(0.0, 0.002), (1.0, 0.012)])
+def test_the_delay_of_positions_is_found_within_its_sigma(late_s: float, noise: float, bound: float) -> None:
+    drive = synthetic_drive(90.0, late_s=late_s, noise=noise)
     windows = moving_windows(drive.t_ns, np.hypot(*drive.velocity[:, :2].T), 6.0, 1.0)
     sigma = np.full_like(drive.position, 0.01)
     found = estimate_clock_offset(strapdown(drive.imu), drive.t_ns, drive.position, sigma, windows, "position")
-    assert abs(found.delay_s + late_s) < 0.005
-    assert abs(found.delay_s + late_s) < 4 * found.sigma_s
-    assert found.rms < 0.015
+    assert abs(found.delay_s + late_s) < bound
+    assert abs(found.delay_s + late_s) < 3 * found.sigma_s
+    assert found.sigma_s < 0.008
+    assert found.rms < 0.012
 
 
 def test_the_delay_of_velocities_is_found_too(drive: Drive) -> None:
@@ -32,7 +34,7 @@ def test_the_delay_of_velocities_is_found_too(drive: Drive) -> None:
 
 
 def test_too_few_windows_are_an_error(drive: Drive) -> None:
-    windows = moving_windows(drive.t_ns, np.hypot(*drive.velocity[:, :2].T), 10.0, 1.0)[:2]
+    windows = moving_windows(drive.t_ns, np.hypot(*drive.velocity[:, :2].T), 10.0, 1.0)[2:4]
     with pytest.raises(EgolocError, match="2 usable windows"):
         estimate_clock_offset(
             strapdown(drive.imu), drive.t_ns, drive.position, np.ones_like(drive.position), windows, "position"
@@ -86,6 +88,6 @@ def test_only_the_first_half_of_a_drive_is_used(drive: Drive) -> None:
         np.where(half[:, None], drive.imu.accel, 0.0),
     )
     again = calibrate(broken, fix, velocity, 0.01)
-    assert whole.position_delay_s == again.position_delay_s == pytest.approx(-0.26, abs=0.005)
-    assert whole.velocity_delay_s == pytest.approx(-0.26, abs=0.015)
+    assert whole.position_delay_s == again.position_delay_s == pytest.approx(-0.26, abs=0.012)
+    assert whole.velocity_delay_s == pytest.approx(-0.26, abs=0.02)
     assert whole.rear_axle[0] == pytest.approx(-1.5, abs=0.15)

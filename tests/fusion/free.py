@@ -1,0 +1,94 @@
+"""Free inertial runs for tests: the real kernel from a given first state, with or without measurements."""
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.alignment import Initial
+from fusion.config import FusionConfig, GnssModel, ImuNoise, MotionModel, PoseModel
+from fusion.events import Events, Recorder, new_recorder
+from fusion.result import Sensor
+from fusion.run import feed, start
+from fusion.state import Core
+from fusion.timeline import APPLY, merge, parameters, sources
+from sensors.geodesy import ecef_from_llh
+from sensors.records import Imu, Log
+from sensors.rotation import q_from_matrix
+from sensors.simulate.drive import DriveConfig, city_truth
+from sensors.simulate.imu import simulate_imu
+from sensors.simulate.trajectory import Motion, Truth
+from sensors.vehicle import Vehicle
+
+Floats = NDArray[np.float64]
+Nanoseconds = NDArray[np.int64]
+
+FREE = FusionConfig(motion=MotionModel(zero_velocity=False, non_holonomic=False))
+"""Nothing but what the log holds."""
+HONEST = FusionConfig(
+    imu=ImuNoise(noise_scale=1.0),
+    gnss=GnssModel(
+        inflation=1.0, sigma_floor_horizontal_m=0.0, sigma_floor_vertical_m=0.0, sigma_floor_velocity=0.0,
+        velocity_inflation=1.0,
+    ),
+    pose=PoseModel(inflation=1.0, sigma_floor_m=0.0, sigma_floor_yaw_deg=0.0),
+)
+"""Noise as the simulator draws it: no inflation, no floors."""
+HONEST_FREE = msgspec.structs.replace(HONEST, motion=FREE.motion)
+
+
+def grid(truth: Truth, duration_s: float, hz: int) -> Nanoseconds:
+    """Stamps from the truth's start to duration_s at a whole rate."""
+    return truth.start_ns + np.arange(round(duration_s * hz) + 1, dtype=np.int64) * (1_000_000_000 // hz)
+
+
+def city(duration_s: float = 300.0, seed: int = 3) -> Truth:
+    return city_truth(duration_s, seed, DriveConfig())
+
+
+def exact_imu(truth: Truth, t_ns: Nanoseconds, vehicle: Vehicle) -> Imu:
+    """Samples without errors."""
+    return simulate_imu(truth, t_ns, vehicle.imu, None)[0]
+
+
+def nav_of(motion: Motion, row: int = 0) -> Floats:
+    """(16,) nominal state of a true motion, biases zero."""
+    return np.concatenate((motion.llh[row], motion.vel_enu[row], motion.q_enu_body[row], np.zeros(6)))
+
+
+def core_at(nav: Floats, imu: Imu, P: Floats | None = None, row: int = 0) -> Core:
+    """A core at sample row of imu; P (15, 15), zeros if not given."""
+    cov = np.zeros((15, 15)) if P is None else P
+    return start(Initial(int(imu.t_ns[row]), nav.copy(), cov.copy(), Sensor.POSE_FIX), imu)
+
+
+def go(
+    core: Core, imu: Imu, vehicle: Vehicle, config: FusionConfig = FREE, log: Log | None = None
+) -> tuple[Recorder, Events]:
+    """Run the samples after the core's time with the log's measurements and the outputs of config."""
+    rest = imu[imu.t_ns > core.clock[0]]
+    found = sources(log or Log(vehicle=vehicle), config)
+    timeline = merge(found, int(core.clock[0]) + 1, int(rest.t_ns[-1]), config, vehicle.land_vehicle)
+    rec = new_recorder(len(timeline.events.t), len(timeline.events.t))
+    feed(core, rest, timeline.events, found.measurements, parameters(vehicle, config), rec)
+    return rec, timeline.events
+
+
+def go_with(core: Core, imu: Imu, vehicle: Vehicle, t_ns: Nanoseconds, kind: int) -> Recorder:
+    """Run the samples after the core's time with events of one kind (MOTION, OUTPUT) at t_ns."""
+    n = len(t_ns)
+    events = Events(t_ns, np.full(n, kind, np.int8), np.full(n, -1), np.full(n, APPLY, np.int8))
+    rec = new_recorder(n, n)
+    rest = imu[imu.t_ns > core.clock[0]]
+    feed(core, rest, events, sources(Log(vehicle=vehicle), FREE).measurements, parameters(vehicle, FREE), rec)
+    return rec
+
+
+def distance(nav: Floats, motion: Motion, row: int = -1) -> float:
+    """Metres in 3-D between the state and a true place."""
+    here = ecef_from_llh(np.stack((nav[:3], motion.llh[row])))
+    return float(np.linalg.norm(here[0] - here[1]))
+
+
+def q_of(matrix: Floats) -> Floats:
+    """(4,) of one (3, 3)."""
+    return q_from_matrix(matrix[None])[0]
