@@ -5,7 +5,6 @@ operations run in the same order.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fusion._linalg import Vector, attitude, axpy, blend, matvec
@@ -14,10 +13,10 @@ from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Reco
 from fusion.gating import correct, innovate, observed_directions, whiten
 from fusion.measurements import body_velocity, gnss_position, gnss_velocity, pose_fix, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
-from fusion.motion import motion
+from fusion.motion import clear, motion
 from fusion.result import Reason, Sensor
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, Core, Floats
-from sensors._kernels import radii
+from sensors._kernels import kernel, radii
 
 _GNSS_POSITION = int(Sensor.GNSS_POSITION)
 _GNSS_VELOCITY = int(Sensor.GNSS_VELOCITY)
@@ -35,7 +34,7 @@ Part = tuple[Interval, float, float, float]
 """Part a..b of an interval (0..1) and its length in seconds."""
 
 
-@njit(cache=True)
+@kernel()
 def process(
     core: Core,
     imu_t: NDArray[np.int64],
@@ -85,7 +84,7 @@ def process(
     return e
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _interval(last: Floats, bent: bool, increments: bool, w: Vector, f: Vector) -> Interval:
     """Rates and forces over the interval that ends with sample (w, f).
 
@@ -104,7 +103,7 @@ def _interval(last: Floats, bent: bool, increments: bool, w: Vector, f: Vector) 
     return w0, w, f0, f, _bend(w_old, w0, w), _bend(f_old, f0, f)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _bend(older: Vector, last: Vector, new: Vector) -> Vector:
     """Half the second difference: the parabola through three samples is the line plus this times (x^2 - x)."""
     return (
@@ -114,7 +113,7 @@ def _bend(older: Vector, last: Vector, new: Vector) -> Vector:
     )
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part) -> None:
     """One strapdown step over a part of an IMU interval."""
     interval, a, b, dt = part
@@ -136,7 +135,7 @@ def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part) 
     strapdown(nav, earth, axpy(bow, w_bend, turn), dv, dt)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _remember(core: Core, t: int, w: Vector, f: Vector) -> None:
     """Keep a sample as the last one and in the ring."""
     core.clock[C_INTERVAL] = t - core.clock[C_SAMPLE]
@@ -150,10 +149,10 @@ def _remember(core: Core, t: int, w: Vector, f: Vector) -> None:
     core.clock[C_COUNT] += 1
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _coast(core: Core, par: Parameters, dt: float) -> None:
     """Bridge a gap in the IMU at constant velocity and attitude, with the covariance widened."""
-    propagate(core.nav, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
     nav = core.nav
     meridian, transverse = radii(np.sin(nav[0]))
     nav[1] += nav[3] * dt / ((transverse + nav[2]) * np.cos(nav[0]))
@@ -163,14 +162,14 @@ def _coast(core: Core, par: Parameters, dt: float) -> None:
     coast(core.P, dt, par.coast_accel, par.coast_rate)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Events, e: int, rate: Vector) -> None:
     """Apply or record event e at the state's time; rate: bias-free body rate, rad/s."""
     kind = ev.kind[e]
     if ev.verdict[e] >= 0:
         _record(rec, e, kind, 0, ev.verdict[e])
         return
-    propagate(core.nav, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
     if kind == OUTPUT:
         _record_state(core, rec, ev.t[e])
         return
@@ -190,56 +189,72 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
     _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
 
 
-@njit(cache=True, inline="always")
+@kernel()
+def _triple(a: Floats, row: int) -> Vector:
+    return a[row, 0], a[row, 1], a[row, 2]
+
+
+@kernel()
+def _copy(cov: Floats, row: int, R: Floats) -> None:
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = cov[row, i, j]
+
+
+@kernel(inline="always")
 def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector) -> int:
     """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom."""
     nav, H, R = core.nav, core.H, core.R
-    H[:] = 0.0
+    clear(H)
     r = attitude(nav)
     if kind == _POSE_FIX:
         dof: int = _measure_pose(core, par, m, row)
         return dof
     if kind == _GNSS_POSITION:
-        R[:] = m.gnss_cov[row]
-        z = gnss_position(nav, r, H, m.gnss_llh[row], par.gnss_arm)
+        _copy(m.gnss_cov, row, R)
+        z = gnss_position(nav, r, H, _triple(m.gnss_llh, row), par.gnss_arm)
     elif kind == _GNSS_VELOCITY:
-        R[:] = m.vel_cov[row]
-        z = gnss_velocity(nav, r, H, m.vel[row], par.gnss_arm, rate)
+        _copy(m.vel_cov, row, R)
+        z = gnss_velocity(nav, r, H, _triple(m.vel, row), par.gnss_arm, rate)
     elif kind == _GNSS_YAW:
         R[0, 0] = m.yaw_var[row]
         z = (wrap(m.yaw[row] - yaw_row(r, H, 0)), 0.0, 0.0)
     else:
         R[0, 0] = m.wheel_var[row]
         z = (m.wheel[row] - body_velocity(nav, r, H, par.axle, rate)[0], 0.0, 0.0)
-        H[1:] = 0.0
+        for j in range(15):
+            H[1, j] = H[2, j] = 0.0
     core.residual[0], core.residual[1], core.residual[2] = z
     return 3 if kind in (_GNSS_POSITION, _GNSS_VELOCITY) else 1
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int:
     """Pose fix in vehicle axes; directions that the histogram does not observe are dropped."""
-    R, r = core.R, attitude(core.nav)
+    R, nav, cov = core.R, core.nav, m.pose_cov
+    r = attitude(nav)
     length = np.sqrt(r[0] * r[0] + r[3] * r[3])
     c, s = r[0] / length, r[3] / length
-    z = pose_fix(r, core.H, core.nav, m.pose_llh[row], m.pose_yaw[row], m.pose_tilt[row], par.pose_arm, (c, s, 0.0))
+    tilt = (m.pose_tilt[row, 0], m.pose_tilt[row, 1])
+    z = pose_fix(r, core.H, nav, _triple(m.pose_llh, row), m.pose_yaw[row], tilt, par.pose_arm, (c, s))
     core.residual[0], core.residual[1], core.residual[2] = z
-    P = m.pose_cov[row]
-    R[0, 0] = c * c * P[0, 0] + 2.0 * c * s * P[0, 1] + s * s * P[1, 1]
-    R[1, 1] = s * s * P[0, 0] - 2.0 * c * s * P[0, 1] + c * c * P[1, 1]
-    R[0, 1] = R[1, 0] = c * s * (P[1, 1] - P[0, 0]) + (c * c - s * s) * P[0, 1]
-    R[0, 2] = R[2, 0] = c * P[0, 2] + s * P[1, 2]
-    R[1, 2] = R[2, 1] = c * P[1, 2] - s * P[0, 2]
-    R[2, 2] = P[2, 2]
+    ee, en, nn = cov[row, 0, 0], cov[row, 0, 1], cov[row, 1, 1]
+    ey, ny = cov[row, 0, 2], cov[row, 1, 2]
+    R[0, 0] = c * c * ee + 2.0 * c * s * en + s * s * nn
+    R[1, 1] = s * s * ee - 2.0 * c * s * en + c * c * nn
+    R[0, 1] = R[1, 0] = c * s * (nn - ee) + (c * c - s * s) * en
+    R[0, 2] = R[2, 0] = c * ey + s * ny
+    R[1, 2] = R[2, 1] = c * ny - s * ey
+    R[2, 2] = cov[row, 2, 2]
     limits = par.pose_limits
     trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
     if trace <= 1.0:  # then every eigenvalue is
         return 3
-    kept: int = observed_directions(core.H, R, core.residual, limits)
+    kept: int = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
     return kept
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accepted: int) -> None:
     """Gate the core's residual and correct the state; complete decision k."""
     L, residual = core.L, core.residual
@@ -258,15 +273,14 @@ def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accept
     rec.scores[k, 0] = score
     if not score <= threshold:
         return
-    correct(core.nav, core.P, core.W, core.dx, residual)
-    refresh(core.nav, core.earth)
+    correct(core.nav, core.earth, core.P, core.W, core.dx, residual)
     dx = core.dx
     rec.reason[k] = accepted
     rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
     rec.scores[k, 3] = abs(dx[8])
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> int:
     """Open a decision; returns its row."""
     k = int(rec.filled[1])
@@ -275,7 +289,7 @@ def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> in
     return k
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _record_state(core: Core, rec: Recorder, t: int) -> None:
     """Record nav, the pose covariance (position, attitude) and every sigma."""
     P = core.P

@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sensors._kernels import kernel
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -12,25 +13,25 @@ Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """Row-major 3x3."""
 
 
-@njit(cache=True)
+@kernel()
 def cross(a: Vector, b: Vector) -> Vector:
     """a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True)
+@kernel()
 def axpy(scale: float, x: Vector, y: Vector) -> Vector:
     """scale x + y."""
     return scale * x[0] + y[0], scale * x[1] + y[1], scale * x[2] + y[2]
 
 
-@njit(cache=True)
+@kernel()
 def blend(a: Vector, b: Vector, weight: float) -> Vector:
     """a + weight (b - a)."""
     return a[0] + weight * (b[0] - a[0]), a[1] + weight * (b[1] - a[1]), a[2] + weight * (b[2] - a[2])
 
 
-@njit(cache=True)
+@kernel()
 def matvec(m: Matrix, v: Vector) -> Vector:
     """M v."""
     return (
@@ -40,7 +41,7 @@ def matvec(m: Matrix, v: Vector) -> Vector:
     )
 
 
-@njit(cache=True)
+@kernel()
 def matvec_t(m: Matrix, v: Vector) -> Vector:
     """M' v."""
     return (
@@ -50,7 +51,7 @@ def matvec_t(m: Matrix, v: Vector) -> Vector:
     )
 
 
-@njit(cache=True)
+@kernel()
 def rotation(q: Quaternion) -> Matrix:
     """Row-major R of a unit quaternion xyzw."""
     x, y, z, w = q
@@ -70,14 +71,14 @@ def rotation(q: Quaternion) -> Matrix:
     )
 
 
-@njit(cache=True)
+@kernel()
 def attitude(nav: NDArray[np.float64]) -> Matrix:
     """R_enu_body of nav (16,)."""
     r: Matrix = rotation((nav[6], nav[7], nav[8], nav[9]))
     return r
 
 
-@njit(cache=True)
+@kernel()
 def exp_q(v: Vector) -> Quaternion:
     """Unit quaternion xyzw of a rotation vector, rad."""
     angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -91,7 +92,7 @@ def exp_q(v: Vector) -> Quaternion:
     return k * v[0], k * v[1], k * v[2], w
 
 
-@njit(cache=True)
+@kernel()
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """Hamilton product a b, xyzw."""
     return (
@@ -102,7 +103,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-@njit(cache=True)
+@kernel()
 def normalize(q: Quaternion) -> Quaternion:
     """q / |q|, by one Newton step near 1 (|q|^2 within 1e-4 gives 1e-9; applied every step it converges)."""
     n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]

@@ -7,11 +7,10 @@ and the attitude, as in preintegration; P' = Phi P Phi' + Q costs one product pe
 import math
 from typing import NamedTuple
 
-from numba import njit
-
 from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
-from fusion.state import A_S, A_U, ROW, Floats
+from fusion.state import A_S, A_U, ACC_SIZE, ROW, Floats
+from sensors._kernels import kernel
 
 Scratch = tuple[Floats, Floats, Floats]
 """phi (9, 16), M (9, 16) and Mt (15, 16) of the core."""
@@ -27,7 +26,7 @@ class Noise(NamedTuple):
     bias_rate: float
 
 
-@njit(cache=True)
+@kernel()
 def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, dt: float) -> None:
     """Add one IMU step to the transition: r is R_enu_body at its start, dv its velocity increment (m/s, ENU).
 
@@ -50,33 +49,33 @@ def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, dt: float) -> N
     span[0] += dt
 
 
-@njit(cache=True)
-def transition(nav: Floats, acc: Floats, span: float, phi: Floats) -> None:
+@kernel()
+def transition(nav: Floats, earth: Floats, acc: Floats, span: float, phi: Floats) -> None:
     """Write phi (9, 16), the upper rows of the transition over the accumulated span; biases decay on their own."""
-    slow_dynamics(nav, phi)
-    for i in range(9):
-        for j in range(9):
-            phi[i, j] *= span
-        phi[i, i] += 1.0
+    slow_dynamics(nav, earth, span, phi)
     for i in range(3):
         phi[i, 3 + i] += span
         for j in range(3):
             phi[i, 9 + j] = acc[11 + i, j]
             phi[i, 12 + j] = -acc[5 + i, j]
             phi[3 + i, 9 + j] = acc[8 + i, j]
-            phi[3 + i, 12 + j] = -acc[2 + i, j]
-            phi[6 + i, 9 + j] = -acc[2 + i, j]
-    # -[u]x and -[s]x: position and velocity against attitude
-    for row, a in ((0, A_U), (3, A_S)):
-        phi[row, 7] += acc[a, 2]
-        phi[row, 8] -= acc[a, 1]
-        phi[row + 1, 6] -= acc[a, 2]
-        phi[row + 1, 8] += acc[a, 0]
-        phi[row + 2, 6] += acc[a, 1]
-        phi[row + 2, 7] -= acc[a, 0]
+            phi[3 + i, 12 + j] = phi[6 + i, 9 + j] = -acc[2 + i, j]
+    _add_minus_skew(phi, 0, acc[A_U, 0], acc[A_U, 1], acc[A_U, 2])
+    _add_minus_skew(phi, 3, acc[A_S, 0], acc[A_S, 1], acc[A_S, 2])
 
 
-@njit(cache=True, fastmath={"contract"})
+@kernel()
+def _add_minus_skew(phi: Floats, row: int, x: float, y: float, z: float) -> None:
+    """Add -[v]x: position or velocity against attitude."""
+    phi[row, 7] += z
+    phi[row, 8] -= y
+    phi[row + 1, 6] -= z
+    phi[row + 1, 8] += x
+    phi[row + 2, 6] += y
+    phi[row + 2, 7] -= x
+
+
+@kernel(fastmath={"contract"})
 def _product(phi: Floats, X: Floats, Y: Floats) -> None:
     """Y (9, 16) = phi (9, 16) X (15, 16). The sum stands inside: the compiler keeps it in vector registers."""
     for i in range(9):
@@ -87,14 +86,16 @@ def _product(phi: Floats, X: Floats, Y: Floats) -> None:
             Y[i, j] = total
 
 
-@njit(cache=True)
-def propagate(nav: Floats, P: Floats, acc: Floats, elapsed: Floats, scratch: Scratch, noise: Noise) -> None:
+@kernel()
+def propagate(
+    nav: Floats, earth: Floats, P: Floats, acc: Floats, elapsed: Floats, scratch: Scratch, noise: Noise
+) -> None:
     """P = Phi P Phi' + Q over the accumulated span, which is then empty."""
     span = elapsed[0]
     if span == 0.0:
         return
     phi, M, Mt = scratch
-    transition(nav, acc, span, phi)
+    transition(nav, earth, acc, span, phi)
     _product(phi, P, M)
     for k in range(15):
         for i in range(9):
@@ -112,10 +113,12 @@ def propagate(nav: Floats, P: Floats, acc: Floats, elapsed: Floats, scratch: Scr
             P[i, j] = P[j, i] = M[i, j]
     _add_noise(P, acc, noise, span, 1.0 - decay * decay)
     elapsed[0] = 0.0
-    acc[:] = 0.0
+    for i in range(ACC_SIZE):
+        for j in range(3):
+            acc[i, j] = 0.0
 
 
-@njit(cache=True)
+@kernel()
 def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float, refilled: float) -> None:
     """Q of white noise integrated over the span (van Loan's integral, to the leading order of each block)."""
     qa, qg = noise.accel_psd * span, noise.gyro_psd * span
@@ -130,12 +133,18 @@ def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float, refilled: floa
     # velocity against attitude: -[s]x qg / 2
     half = 0.5 * qg
     x, y, z = half * acc[A_S, 0], half * acc[A_S, 1], half * acc[A_S, 2]
-    for i, j, value in ((3, 7, z), (3, 8, -y), (4, 6, -z), (4, 8, x), (5, 6, y), (5, 7, -x)):
-        P[i, j] += value
-        P[j, i] += value
+    P[3, 7] += z
+    P[3, 8] -= y
+    P[4, 6] -= z
+    P[4, 8] += x
+    P[5, 6] += y
+    P[5, 7] -= x
+    for i in range(3, 6):
+        for j in range(6, 9):
+            P[j, i] = P[i, j]
 
 
-@njit(cache=True)
+@kernel()
 def coast(P: Floats, seconds: float, accel: float, rate: float) -> None:
     """Widen P over a gap in the IMU: velocity and attitude walk by accel (m/s) and rate (rad) in the first second."""
     for i in range(15):

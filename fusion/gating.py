@@ -2,47 +2,85 @@
 
 import math
 
-import numpy as np
-from numba import njit
-
 from fusion._linalg import Quaternion, Vector, exp_q, multiply, normalize
-from fusion.state import ROW, Floats
-from sensors._kernels import radii
+from fusion.mechanization import refresh
+from fusion.state import G_COS, G_HEIGHT, G_MERIDIAN, G_SIN, G_TRANSVERSE, ROW, Floats
+from sensors._kernels import kernel
+
+FAR_M = 10.0
+"""A correction of more than this asks for new radii of curvature."""
 
 
-@njit(cache=True)
-def observed_directions(H: Floats, R: Floats, residual: Floats, limits: Vector) -> int:
+@kernel()
+def observed_directions(H: Floats, R: Floats, residual: Floats, limits: Vector, eigen: Floats, rows: Floats) -> int:
     """Reduce residual, H and R (along, left, yaw) to the directions that a pose fix observes; return how many.
 
     Eigenvectors u of D^-1 R D^-1, D = diag(limits) (m, m, rad), with an eigenvalue of at most 1 are observed.
     The rows become u' D^-1 of the old ones, so residuals are in units of the limits and R is diagonal. Where all three
-    are observed nothing changes.
+    are observed nothing changes. eigen (2, 3, 3), rows (3, 16): scratch.
     """
-    scaled = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
-            scaled[i, j] = R[i, j] / (limits[i] * limits[j])
-    values, vectors = np.linalg.eigh(scaled)  # eigenvalues rise: the kept ones come first
+            eigen[0, i, j] = R[i, j] / (limits[i] * limits[j])
+    diagonalize(eigen)
     kept = 0
-    while kept < 3 and values[kept] <= 1.0:
-        kept += 1
+    for k in range(3):
+        if eigen[0, k, k] <= 1.0:
+            kept += 1
     if kept == 3:
         return 3
-    rows, z = H.copy(), residual.copy()
-    H[:] = 0.0
-    R[:] = 0.0
-    for i in range(kept):
-        R[i, i] = values[i]
+    z: Vector = (residual[0], residual[1], residual[2])
+    for i in range(3):
+        for j in range(ROW):
+            rows[i, j] = H[i, j]
+            H[i, j] = 0.0
+        for j in range(3):
+            R[i, j] = 0.0
+    i = 0
+    for k in range(3):
+        if eigen[0, k, k] > 1.0:
+            continue
+        R[i, i] = eigen[0, k, k]
         residual[i] = 0.0
-        for k in range(3):
-            t = vectors[k, i] / limits[k]
-            residual[i] += t * z[k]
+        for a in range(3):
+            t = eigen[1, a, k] / limits[a]
+            residual[i] += t * z[a]
             for j in range(9):
-                H[i, j] += t * rows[k, j]
+                H[i, j] += t * rows[a, j]
+        i += 1
     return kept
 
 
-@njit(cache=True, fastmath={"contract"})
+@kernel()
+def diagonalize(eigen: Floats) -> None:
+    """Eigenvalues of the symmetric eigen[0] on its diagonal, eigenvectors in the columns of eigen[1]: cyclic Jacobi.
+
+    Rotations shrink the off-diagonal quadratically; six sweeps reach rounding for any 3x3 (Golub & Van Loan, sec. 8.5).
+    """
+    for i in range(3):
+        for j in range(3):
+            eigen[1, i, j] = 1.0 if i == j else 0.0
+    for _ in range(6):
+        for p in range(2):
+            for q in range(p + 1, 3):
+                off = eigen[0, p, q]
+                if off == 0.0:
+                    continue
+                theta = 0.5 * (eigen[0, q, q] - eigen[0, p, p]) / off
+                t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(3):
+                    a, b = eigen[0, k, p], eigen[0, k, q]
+                    eigen[0, k, p], eigen[0, k, q] = c * a - s * b, s * a + c * b
+                for k in range(3):
+                    a, b = eigen[0, p, k], eigen[0, q, k]
+                    eigen[0, p, k], eigen[0, q, k] = c * a - s * b, s * a + c * b
+                    a, b = eigen[1, k, p], eigen[1, k, q]
+                    eigen[1, k, p], eigen[1, k, q] = c * a - s * b, s * a + c * b
+
+
+@kernel(fastmath={"contract"})
 def innovate(P: Floats, H: Floats, W: Floats, dof: int, R: Floats, L: Floats) -> bool:
     """W (3, 16) = L^-1 H P with L L' = S = H P H' + R, the lower Cholesky factor; rows of H from dof on are zero.
 
@@ -77,10 +115,11 @@ def innovate(P: Floats, H: Floats, W: Floats, dof: int, R: Floats, L: Floats) ->
     return True
 
 
-@njit(cache=True)
+@kernel()
 def whiten(dof: int, residual: Floats, L: Floats) -> float:
     """residual (3,) = L^-1 residual in place, zero from dof on; returns the normalized innovation squared."""
-    residual[dof:] = 0.0
+    for i in range(dof, 3):
+        residual[i] = 0.0
     total = 0.0
     for i in range(dof):
         for k in range(i):
@@ -90,8 +129,8 @@ def whiten(dof: int, residual: Floats, L: Floats) -> float:
     return total
 
 
-@njit(cache=True, fastmath={"contract"})
-def correct(nav: Floats, P: Floats, W: Floats, dx: Floats, white: Floats) -> None:
+@kernel(fastmath={"contract"})
+def correct(nav: Floats, earth: Floats, P: Floats, W: Floats, dx: Floats, white: Floats) -> None:
     """Kalman update after ``innovate`` and ``whiten``: dx = W' w, P -= W' W, then the error is moved into nav.
 
     Resetting the attitude error turns its axes: P is mapped by G = I + [dtheta]x / 2, the left Jacobian of SO(3) to
@@ -103,17 +142,24 @@ def correct(nav: Floats, P: Floats, W: Floats, dx: Floats, white: Floats) -> Non
         a, b, c = W[0, i], W[1, i], W[2, i]
         for j in range(ROW):
             P[i, j] -= a * W[0, j] + b * W[1, j] + c * W[2, j]
-    inject(nav, dx)
+    inject(nav, earth, dx)
     reset(P, (0.5 * dx[6], 0.5 * dx[7], 0.5 * dx[8]))
 
 
-@njit(cache=True)
-def inject(nav: Floats, dx: Floats) -> None:
+@kernel()
+def inject(nav: Floats, earth: Floats, dx: Floats) -> None:
     """Add the error dx (15,) to nav (16,): metres to radians at the state's place, attitude on the left."""
-    meridian, transverse = radii(math.sin(nav[0]))
-    nav[1] += dx[0] / ((transverse + nav[2]) * math.cos(nav[0]))
-    nav[0] += dx[1] / (meridian + nav[2])
+    climb = nav[2] - earth[G_HEIGHT]
+    m = earth[G_MERIDIAN] * (1.0 - climb * earth[G_MERIDIAN])
+    n = earth[G_TRANSVERSE] * (1.0 - climb * earth[G_TRANSVERSE])
+    dlat = dx[1] * m
+    nav[1] += dx[0] * n / earth[G_COS]
+    nav[0] += dlat
     nav[2] += dx[2]
+    if abs(dx[0]) + abs(dx[1]) + abs(dx[2]) > FAR_M:
+        refresh(nav, earth)
+    else:
+        earth[G_SIN], earth[G_COS] = earth[G_SIN] + earth[G_COS] * dlat, earth[G_COS] - earth[G_SIN] * dlat
     for i in range(3):
         nav[3 + i] += dx[3 + i]
         nav[10 + i] += dx[9 + i]
@@ -123,7 +169,7 @@ def inject(nav: Floats, dx: Floats) -> None:
     nav[6], nav[7], nav[8], nav[9] = normalize(multiply(turn, q))
 
 
-@njit(cache=True, fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def reset(P: Floats, half: Vector) -> None:
     """P = G P G' with G = I + [half]x on the attitude block."""
     for j in range(ROW):

@@ -7,14 +7,14 @@ the true rate, so ``d(omega) = -dbg``.
 
 import math
 
-from numba import njit
-
 from fusion._linalg import Matrix, Vector, cross, matvec, matvec_t
 from fusion.state import Floats
-from sensors._kernels import EARTH_RATE, radii
+from sensors._kernels import EARTH_RATE, kernel, radii
+
+Pair = tuple[float, float]
 
 
-@njit(cache=True)
+@kernel()
 def _minus_skew(H: Floats, row: int, column: int, v: Vector) -> None:
     """Write -[v]x at (row, column)."""
     H[row, column + 1], H[row, column + 2] = v[2], -v[1]
@@ -22,19 +22,22 @@ def _minus_skew(H: Floats, row: int, column: int, v: Vector) -> None:
     H[row + 2, column], H[row + 2, column + 1] = v[1], -v[0]
 
 
-@njit(cache=True)
+@kernel()
 def offset_enu(nav: Floats, lat: float, lon: float, height: float) -> Vector:
-    """The state's position seen from a point nearby, ENU m (to first order, as the error state is)."""
+    """The state's position seen from a point nearby, ENU m (to first order, as the error state is).
+
+    Metres are those at the state's height: a map's ground may lie hundreds of metres below it.
+    """
     meridian, transverse = radii(math.sin(lat))
     return (
-        (nav[1] - lon) * (transverse + height) * math.cos(lat),
-        (nav[0] - lat) * (meridian + height),
+        (nav[1] - lon) * (transverse + nav[2]) * math.cos(lat),
+        (nav[0] - lat) * (meridian + nav[2]),
         nav[2] - height,
     )
 
 
-@njit(cache=True)
-def gnss_position(nav: Floats, r: Matrix, H: Floats, llh: Floats, arm: Vector) -> Vector:
+@kernel()
+def gnss_position(nav: Floats, r: Matrix, H: Floats, llh: Vector, arm: Vector) -> Vector:
     """Antenna position llh (3,): ENU m. H = [I 0 -[R l]x]."""
     lever = matvec(r, arm)
     east, north, up = offset_enu(nav, llh[0], llh[1], llh[2])
@@ -44,8 +47,8 @@ def gnss_position(nav: Floats, r: Matrix, H: Floats, llh: Floats, arm: Vector) -
     return -east - lever[0], -north - lever[1], -up - lever[2]
 
 
-@njit(cache=True)
-def gnss_velocity(nav: Floats, r: Matrix, H: Floats, vel: Floats, arm: Vector, rate: Vector) -> Vector:
+@kernel()
+def gnss_velocity(nav: Floats, r: Matrix, H: Floats, vel: Vector, arm: Vector, rate: Vector) -> Vector:
     """Antenna velocity vel (3,) ENU m/s; rate: bias-free body rate against inertial space.
 
     v + R (omega x l) - omega_ie x R l; H = [0 I -[R (omega x l)]x R [l]x].
@@ -66,7 +69,7 @@ def gnss_velocity(nav: Floats, r: Matrix, H: Floats, vel: Floats, arm: Vector, r
     )
 
 
-@njit(cache=True)
+@kernel()
 def yaw_row(r: Matrix, H: Floats, row: int) -> float:
     """Yaw of the body (ccw from east) and its Jacobian against the attitude error."""
     horizontal = r[0] * r[0] + r[3] * r[3]
@@ -76,17 +79,17 @@ def yaw_row(r: Matrix, H: Floats, row: int) -> float:
     return math.atan2(r[3], r[0])
 
 
-@njit(cache=True)
+@kernel()
 def wrap(angle: float) -> float:
     """Angle in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@njit(cache=True)
+@kernel()
 def pose_fix(
-    r: Matrix, H: Floats, nav: Floats, llh: Floats, yaw: float, tilt: Floats, arm: Vector, heading: Vector
+    r: Matrix, H: Floats, nav: Floats, llh: Vector, yaw: float, tilt: Pair, arm: Vector, heading: Pair
 ) -> Vector:
-    """EgoVM's (x, y, yaw), along and left of the heading (cos, sin, -) and yaw: m, m, rad.
+    """EgoVM's (x, y, yaw), along and left of the heading (cos, sin) and yaw: m, m, rad.
 
     llh (3,): the fix on the map's ground surface; tilt (2,): horizontal metres per metre of height between the local
     vertical and the map's, so that height does not leak into x and y.
@@ -105,7 +108,7 @@ def pose_fix(
     return -(c * east + s * north), s * east - c * north, wrap(yaw - predicted)
 
 
-@njit(cache=True)
+@kernel()
 def body_velocity(nav: Floats, r: Matrix, H: Floats, arm: Vector, rate: Vector) -> Vector:
     """Velocity of a body point (the rear axle) in body axes, m/s, with its Jacobian: R'v + omega x l.
 

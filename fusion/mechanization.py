@@ -2,8 +2,6 @@
 
 import math
 
-from numba import njit
-
 from fusion._linalg import Quaternion, Vector, axpy, cross, exp_q, multiply, normalize
 from fusion.state import (
     G_AGE,
@@ -16,15 +14,15 @@ from fusion.state import (
     G_UP,
     Floats,
 )
-from sensors._kernels import EARTH_RATE, gravity_enu, radii
+from sensors._kernels import EARTH_RATE, gravity_enu, kernel, radii
 
-MAX_AGE_S = 0.1
-"""Radii of curvature and gravity are refreshed after this long."""
+MAX_AGE = 5
+"""Radii of curvature and gravity are refreshed after so many steps."""
 GRAVITY_GRADIENT = 3.086e-6
 """Fall of gravity with height, 1/s^2 (free air)."""
 
 
-@njit(cache=True)
+@kernel()
 def increments(w0: Vector, w1: Vector, f0: Vector, f1: Vector, dt: float) -> tuple[Vector, Vector]:
     """Rotation vector and velocity increment (axes at the start) over dt, rates and forces linear in between.
 
@@ -38,7 +36,7 @@ def increments(w0: Vector, w1: Vector, f0: Vector, f1: Vector, dt: float) -> tup
     return axpy(k, cross(w0, w1), turn), axpy(1.0 / 6.0, cross(turn, turned), dv)
 
 
-@njit(cache=True)
+@kernel()
 def refresh(nav: Floats, earth: Floats) -> None:
     """Recompute what depends on the place (G_*): radii of curvature and gravity there."""
     sin_lat, cos_lat, height = math.sin(nav[0]), math.cos(nav[0]), nav[2]
@@ -50,17 +48,17 @@ def refresh(nav: Floats, earth: Floats) -> None:
     earth[G_AGE] = 0.0
 
 
-@njit(cache=True)
+@kernel()
 def strapdown(nav: Floats, earth: Floats, turn: Vector, dv: Vector, dt: float) -> None:
     """Advance nav (16,) in place by dt.
 
     turn: rotation vector of the body against inertial space, body axes; dv: specific force integrated, ENU axes at the
     start. Second order in dt: Coriolis, transport and gravity at mid-step, position by the trapezoid of velocity.
-    Latitude's sine and cosine follow by first-order steps; radii wait for ``refresh``: over 0.1 s they change by 1e-8.
+    Latitude's sine and cosine follow by first-order steps; radii and gravity wait for ``refresh``.
     """
-    if earth[G_AGE] > MAX_AGE_S:
+    if earth[G_AGE] >= MAX_AGE:
         refresh(nav, earth)
-    earth[G_AGE] += dt
+    earth[G_AGE] += 1.0
     sin_lat, cos_lat, m, n = earth[G_SIN], earth[G_COS], earth[G_MERIDIAN], earth[G_TRANSVERSE]
     half = 0.5 * dt
     secant = 1.0 / cos_lat
@@ -91,59 +89,64 @@ def strapdown(nav: Floats, earth: Floats, turn: Vector, dv: Vector, dt: float) -
     nav[6], nav[7], nav[8], nav[9] = normalize(multiply(frame, multiply(q, exp_q(turn))))
 
 
-@njit(cache=True)
-def slow_dynamics(nav: Floats, F: Floats) -> None:
-    """Write the slow 9x9 part of the error dynamics into F (9, 16): earth, transport and gravity terms, 1/s.
+@kernel()
+def slow_dynamics(nav: Floats, earth: Floats, t: float, F: Floats) -> None:
+    """Write I + t times the slow part of the error dynamics into F[:9, :9]: earth, transport and gravity terms.
 
     Left out here: position against velocity (identity) and all that the IMU's samples enter, which ``covariance`` sums
     step by step. The change of the radii of curvature with latitude (0.3 % of these terms) is neglected.
     """
     ve, vn, vu = nav[3], nav[4], nav[5]
-    sin_lat, cos_lat = math.sin(nav[0]), math.cos(nav[0])
-    tan_lat = sin_lat / cos_lat
-    meridian, transverse = radii(sin_lat)
-    rm, rn = meridian + nav[2], transverse + nav[2]
-    e_rate, n_rate = ve / rn, vn / rm
+    sin_lat, cos_lat = earth[G_SIN], earth[G_COS]
+    secant = 1.0 / cos_lat
+    tan_lat = sin_lat * secant
+    m, n = earth[G_MERIDIAN], earth[G_TRANSVERSE]
+    e_rate, n_rate = ve * n, vn * m
     ie_n, ie_u = EARTH_RATE * cos_lat, EARTH_RATE * sin_lat
-    F[:, :9] = 0.0
+    for i in range(9):
+        for j in range(9):
+            F[i, j] = 0.0
 
     # position: ENU axes turn with the motion
-    F[0, 0] = vu / rn - tan_lat * n_rate
-    F[0, 1] = ve * tan_lat / rm
-    F[0, 2] = -e_rate
-    F[1, 1] = vu / rm
-    F[1, 2] = -n_rate
+    F[0, 0] = 1.0 + t * (vu * n - tan_lat * n_rate)
+    F[0, 1] = t * ve * tan_lat * m
+    F[0, 2] = -t * e_rate
+    F[1, 1] = 1.0 + t * vu * m
+    F[1, 2] = -t * n_rate
+    F[2, 2] = 1.0
 
     # velocity against position: earth rate and transport rate change with latitude and height, gravity with height
-    wu_lat = (2.0 * ie_n + e_rate / (cos_lat * cos_lat)) / rm
-    wn_lat = -2.0 * ie_u / rm
-    F[3, 1] = wu_lat * vn - wn_lat * vu
-    F[4, 1] = -wu_lat * ve
-    F[5, 1] = wn_lat * ve
-    F[3, 2] = -(e_rate * tan_lat * vn - e_rate * vu) / rn
-    F[4, 2] = e_rate * tan_lat * ve / rn + n_rate * vu / rm
-    F[5, 2] = -(e_rate * ve / rn + n_rate * vn / rm) + GRAVITY_GRADIENT
+    wu_lat = (2.0 * ie_n + e_rate * secant * secant) * m
+    wn_lat = -2.0 * ie_u * m
+    F[3, 1] = t * (wu_lat * vn - wn_lat * vu)
+    F[4, 1] = -t * wu_lat * ve
+    F[5, 1] = t * wn_lat * ve
+    F[3, 2] = -t * (e_rate * tan_lat * vn - e_rate * vu) * n
+    F[4, 2] = t * (e_rate * tan_lat * ve * n + n_rate * vu * m)
+    F[5, 2] = t * (GRAVITY_GRADIENT - e_rate * ve * n - n_rate * vn * m)
 
     # velocity against velocity: Coriolis and transport
-    F[3, 3] = (vn * tan_lat - vu) / rn
-    F[3, 4] = 2.0 * ie_u + e_rate * tan_lat
-    F[3, 5] = -(2.0 * ie_n + e_rate)
-    F[4, 3] = -(2.0 * ie_u + 2.0 * e_rate * tan_lat)
-    F[4, 4] = -vu / rm
-    F[4, 5] = -n_rate
-    F[5, 3] = 2.0 * ie_n + 2.0 * e_rate
-    F[5, 4] = 2.0 * n_rate
+    F[3, 3] = 1.0 + t * (vn * tan_lat - vu) * n
+    F[3, 4] = t * (2.0 * ie_u + e_rate * tan_lat)
+    F[3, 5] = -t * (2.0 * ie_n + e_rate)
+    F[4, 3] = -t * (2.0 * ie_u + 2.0 * e_rate * tan_lat)
+    F[4, 4] = 1.0 - t * vu * m
+    F[4, 5] = -t * n_rate
+    F[5, 3] = 2.0 * t * (ie_n + e_rate)
+    F[5, 4] = 2.0 * t * n_rate
+    F[5, 5] = 1.0
 
     # attitude: the navigation frame turns by w_in, and w_in depends on position and velocity
-    F[6, 2] = -n_rate / rm
-    F[7, 1] = ie_u / rm
-    F[7, 2] = e_rate / rn
-    F[8, 1] = -(ie_n + e_rate / (cos_lat * cos_lat)) / rm
-    F[8, 2] = e_rate * tan_lat / rn
-    F[6, 4] = 1.0 / rm
-    F[7, 3] = -1.0 / rn
-    F[8, 3] = -tan_lat / rn
-    w_e, w_n, w_u = -n_rate, ie_n + e_rate, ie_u + e_rate * tan_lat
+    F[6, 2] = -t * n_rate * m
+    F[7, 1] = t * ie_u * m
+    F[7, 2] = t * e_rate * n
+    F[8, 1] = -t * (ie_n + e_rate * secant * secant) * m
+    F[8, 2] = t * e_rate * tan_lat * n
+    F[6, 4] = t * m
+    F[7, 3] = -t * n
+    F[8, 3] = -t * tan_lat * n
+    w_e, w_n, w_u = -t * n_rate, t * (ie_n + e_rate), t * (ie_u + e_rate * tan_lat)
+    F[6, 6] = F[7, 7] = F[8, 8] = 1.0
     F[6, 7], F[6, 8] = w_u, -w_n
     F[7, 6], F[7, 8] = -w_u, w_e
     F[8, 6], F[8, 7] = w_n, -w_e

@@ -1,7 +1,6 @@
 """What a land vehicle cannot do: slip sideways, or move while it stands."""
 
 import numpy as np
-from numba import njit
 
 from fusion._linalg import Vector, attitude, matvec_t
 from fusion.events import Parameters
@@ -9,7 +8,7 @@ from fusion.gating import correct, innovate, whiten
 from fusion.measurements import body_velocity
 from fusion.result import Sensor
 from fusion.state import C_COUNT, C_TICK, RING_SIZE, Core, Floats, Nanoseconds
-from sensors._kernels import EARTH_RATE
+from sensors._kernels import EARTH_RATE, kernel
 
 _ZERO_VELOCITY = int(Sensor.ZERO_VELOCITY)
 _NON_HOLONOMIC = int(Sensor.NON_HOLONOMIC)
@@ -18,15 +17,24 @@ StillLimits = tuple[int, float, float]
 """Window ns, variance of the specific force's norm (m/s^2)^2 and of each rate (rad/s)^2."""
 
 
-@njit(cache=True)
+@kernel()
+def clear(a: Floats) -> None:
+    """Set a matrix to zero (a plain loop: cheaper here than a slice)."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            a[i, j] = 0.0
+
+
+@kernel()
 def still(
-    ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, limits: StillLimits, now: int
+    ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, sums: Floats, limits: StillLimits, now: int
 ) -> tuple[bool, float, float, float]:
-    """Whether the IMU was quiet over the window before now, and its mean rate since the last motion tick, rad/s."""
+    """Whether the IMU was quiet over the window before now, and its mean rate since the last motion tick, rad/s.
+
+    sums (3, 3): scratch for the rates, their squares, and the rates since the tick.
+    """
     count = clock[C_COUNT]
-    total = np.zeros(3)
-    squares = np.zeros(3)
-    recent = np.zeros(3)
+    clear(sums)
     norm, norm2 = 0.0, 0.0
     n, fresh = 0, 0
     oldest = now
@@ -39,12 +47,12 @@ def still(
         n += 1
         for k in range(3):
             rate = ring[i, k] - nav[10 + k]
-            total[k] += rate
-            squares[k] += rate * rate
+            sums[0, k] += rate
+            sums[1, k] += rate * rate
         if t > clock[C_TICK]:
             fresh += 1
             for k in range(3):
-                recent[k] += ring[i, k]
+                sums[2, k] += ring[i, k]
         f2 = ring[i, 3] ** 2 + ring[i, 4] ** 2 + ring[i, 5] ** 2
         norm += np.sqrt(f2)
         norm2 += f2
@@ -52,12 +60,12 @@ def still(
         return False, 0.0, 0.0, 0.0
     quiet = norm2 / n - (norm / n) ** 2 < limits[1]
     for k in range(3):
-        mean = total[k] / n
-        quiet = quiet and squares[k] / n - mean * mean < limits[2]
-    return quiet, recent[0] / fresh, recent[1] / fresh, recent[2] / fresh
+        mean = sums[0, k] / n
+        quiet = quiet and sums[1, k] / n - mean * mean < limits[2]
+    return quiet, sums[2, 0] / fresh, sums[2, 1] / fresh, sums[2, 2] / fresh
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, int]:
     """Residual, H and R of what the motion allows: sensor and degrees of freedom, 0 for nothing.
 
@@ -69,12 +77,12 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     quiet = False
     if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4] + P[5, 5]):
         limits = (par.still_window_ns, par.still_accel_var, par.still_rate_var)
-        quiet, w0, w1, w2 = still(core.ring, core.ring_t, core.clock, nav, limits, now)
+        quiet, w0, w1, w2 = still(core.ring, core.ring_t, core.clock, nav, core.L, limits, now)
         if quiet:
             _zero_rate(core, par, (w0, w1, w2))
     core.clock[C_TICK] = now
-    R[:] = 0.0
-    core.H[:] = 0.0
+    clear(R)
+    clear(core.H)
     if quiet:
         for i in range(3):
             core.H[i, 3 + i] = 1.0
@@ -92,16 +100,16 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     return _NON_HOLONOMIC, 2
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
     """At rest the gyro shows its bias and the earth's turning: mean = bg + R' omega_ie. Gated, but not recorded."""
     nav, R, residual = core.nav, core.R, core.residual
     earth = matvec_t(attitude(nav), (0.0, EARTH_RATE * np.cos(nav[0]), EARTH_RATE * np.sin(nav[0])))
-    R[:] = 0.0
-    core.H[:] = 0.0
+    clear(R)
+    clear(core.H)
     for i in range(3):
         core.H[i, 9 + i] = 1.0
         R[i, i] = par.zero_rate_var
         residual[i] = mean[i] - earth[i] - nav[10 + i]
     if innovate(core.P, core.H, core.W, 3, R, core.L) and whiten(3, residual, core.L) <= par.gate[2]:
-        correct(nav, core.P, core.W, core.dx, residual)
+        correct(nav, core.earth, core.P, core.W, core.dx, residual)

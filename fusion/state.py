@@ -65,7 +65,8 @@ class Core(NamedTuple):
     span (1,): seconds since P was propagated; acc (14, 3): the transition over them (A_*).
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
-    phi, M (9, 16), Mt (15, 16), H, W (3, 16), R, L (3, 3), residual (3,), dx (16,): scratch.
+    phi, M (9, 16), Mt (15, 16), H, W (3, 16), R, L (3, 3),
+    eigen (2, 3, 3), residual (3,), dx (16,): scratch.
     """
 
     clock: Nanoseconds
@@ -84,6 +85,7 @@ class Core(NamedTuple):
     W: Floats
     R: Floats
     L: Floats
+    eigen: Floats
     residual: Floats
     dx: Floats
 
@@ -107,6 +109,7 @@ def new_core() -> Core:
         W=np.zeros((3, ROW)),
         R=np.zeros((3, 3)),
         L=np.zeros((3, 3)),
+        eigen=np.zeros((2, 3, 3)),
         residual=np.zeros(3),
         dx=np.zeros(ROW),
     )

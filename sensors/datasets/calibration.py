@@ -29,6 +29,8 @@ MIN_SPEED_CHANGE = 1.5
 """A window whose speed changes less says little about time and heading, m/s."""
 MAX_CLOCK_SIGMA_S = 0.02
 """An offset less certain than this, or within two of its sigmas of zero, is not applied."""
+MIN_HALF_NS = 30_000_000_000
+"""Less than this shows nothing."""
 MAX_AXIS_SIGMA_DEG = 3.0
 """A mounting less certain than this is not applied."""
 
@@ -62,6 +64,9 @@ def calibrate(imu: Imu, gnss: GnssFix, velocity: GnssVelocity, noise_m: float) -
     """
     first = max(imu.t_ns[0], gnss.t_ns[0])
     middle = first + (min(imu.t_ns[-1], gnss.t_ns[-1]) - first) // 2
+    if middle - first < MIN_HALF_NS:
+        log.info("IMU and GNSS share less than a minute: nothing is estimated")
+        return Calibration(None, 0.0, None)
     path = strapdown(imu[imu.t_ns <= middle])
     rows = (gnss.t_ns >= first) & (gnss.t_ns <= middle)
     gnss, velocity = gnss[rows], velocity[rows]

@@ -71,10 +71,12 @@ def estimate_clock_offset(
 
 
 def velocity_lag(t_ns: NDArray[np.int64], position: Floats, velocity: Floats, search_s: float = 0.5) -> float:
-    """How long a receiver's velocity lags behind its own positions (same stamps, both (N, 3) ENU), s."""
+    """How long a receiver's velocity lags behind its own positions (same stamps, (N, 3) ENU), s; 0 if too short."""
     t = (t_ns - t_ns[0]) * 1e-9
     slope = CubicSpline(t, position).derivative()
     inner = (t > t[0] + search_s + 1) & (t < t[-1] - search_s - 1)
+    if inner.sum() < 20:
+        return 0.0
     lags = np.arange(-search_s, search_s + 0.005, 0.01)
     costs = np.array([np.mean((velocity[inner] - slope(t[inner] - lag))[:, :2] ** 2) for lag in lags])
     middle = int(np.clip(np.argmin(costs), 1, len(lags) - 2))

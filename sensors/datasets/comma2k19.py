@@ -87,6 +87,7 @@ def _ns(boot_ns: int, t_s: Floats) -> Nanoseconds:
 
 
 def _imu(src: Path, boot_ns: int, R_body_camera: Floats) -> tuple[Imu, tuple[LeftOut, ...]]:
+    """Uncalibrated rates less the phone's own bias at the start: 4 deg/s, but no steps within the segment."""
     t = _array(src, "processed_log/IMU/gyro/t", 1)
     gyro, accel = (_array(src, f"processed_log/IMU/{name}/value", 3) for name in ("gyro_uncalibrated", "accelerometer"))
     if not len(t) == len(gyro) == len(accel):
@@ -94,6 +95,8 @@ def _imu(src: Path, boot_ns: int, R_body_camera: Floats) -> tuple[Imu, tuple[Lef
     t_ns = _ns(boot_ns, t)
     finite = np.all(np.isfinite(np.column_stack((t, gyro, accel))), axis=1)
     keep, left_out = screen("IMU", t_ns, t_ns, {"not finite": finite})
+    bias = _array(src, "processed_log/IMU/gyro_bias/value", 3)[0]
+    gyro = gyro - np.where(np.isfinite(bias), bias, 0.0)
     R = R_body_camera @ FRD
     return Imu(t_ns[keep], t_ns[keep], gyro[keep] @ R.T, accel[keep] @ R.T), left_out
 

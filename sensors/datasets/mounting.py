@@ -62,6 +62,8 @@ def estimate_mounting(
     Each window is left out once (jackknife) for the sigmas. Raises EgolocError with fewer than 4 windows faster than
     MIN_SPEED whose heading is known.
     """
+    if not fits:
+        raise EgolocError("mounting: no window of IMU and GNSS in motion")
     up, pitch_sigma = turning_axis(path, gyro, t_ns, fits)
     motion = _motion(path, gyro @ up, t_ns, delay_s, fits)
     names = np.unique(motion.window)

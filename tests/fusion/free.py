@@ -3,17 +3,17 @@
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fusion.alignment import Initial
 from fusion.config import FusionConfig, GnssModel, ImuNoise, MotionModel, PoseModel
-from fusion.events import Events, Recorder, new_recorder
+from fusion.events import Events, Measurements, Recorder, new_recorder
 from fusion.result import Sensor
 from fusion.run import feed, start
-from fusion.state import Core
+from fusion.state import E_ATTITUDE, E_VELOCITY, LLH, QUATERNION, VELOCITY, Core
 from fusion.timeline import APPLY, merge, parameters, sources
-from sensors.geodesy import ecef_from_llh
+from sensors.geodesy import ecef_from_llh, meridian_radius, transverse_radius
 from sensors.records import Imu, Log
-from sensors.rotation import q_from_matrix
 from sensors.simulate.drive import DriveConfig, city_truth
 from sensors.simulate.imu import simulate_imu
 from sensors.simulate.trajectory import Motion, Truth
@@ -27,7 +27,10 @@ FREE = FusionConfig(motion=MotionModel(zero_velocity=False, non_holonomic=False)
 HONEST = FusionConfig(
     imu=ImuNoise(noise_scale=1.0),
     gnss=GnssModel(
-        inflation=1.0, sigma_floor_horizontal_m=0.0, sigma_floor_vertical_m=0.0, sigma_floor_velocity=0.0,
+        inflation=1.0,
+        sigma_floor_horizontal_m=0.0,
+        sigma_floor_vertical_m=0.0,
+        sigma_floor_velocity=0.0,
         velocity_inflation=1.0,
     ),
     pose=PoseModel(inflation=1.0, sigma_floor_m=0.0, sigma_floor_yaw_deg=0.0),
@@ -89,6 +92,35 @@ def distance(nav: Floats, motion: Motion, row: int = -1) -> float:
     return float(np.linalg.norm(here[0] - here[1]))
 
 
-def q_of(matrix: Floats) -> Floats:
-    """(4,) of one (3, 3)."""
-    return q_from_matrix(matrix[None])[0]
+def nothing(vehicle: Vehicle) -> tuple[Events, Measurements, Recorder]:
+    """No events, no measurements, and nowhere to record."""
+    none = np.empty(0, np.int64)
+    events = Events(none, none.astype(np.int8), none, none.astype(np.int8))
+    return events, sources(Log(vehicle=vehicle), FREE).measurements, new_recorder(0, 0)
+
+
+def plus(nav: Floats, dx: Floats) -> Floats:
+    """Plain numpy: nav (16,) moved by the error dx (15,), metres to radians there, attitude on the left."""
+    moved = nav.copy()
+    meridian, transverse = float(meridian_radius(nav[0])) + nav[2], float(transverse_radius(nav[0])) + nav[2]
+    moved[LLH] += np.array([dx[1] / meridian, dx[0] / (transverse * np.cos(nav[0])), dx[2]])
+    moved[VELOCITY] += dx[E_VELOCITY]
+    moved[QUATERNION] = (Rotation.from_rotvec(dx[E_ATTITUDE]) * Rotation.from_quat(nav[QUATERNION])).as_quat()
+    moved[10:] += dx[9:15]
+    return moved
+
+
+def minus(a: Floats, b: Floats) -> Floats:
+    """(15,) error that ``plus`` adds to b to get a (to first order in position)."""
+    meridian, transverse = float(meridian_radius(b[0])) + b[2], float(transverse_radius(b[0])) + b[2]
+    dlat, dlon, up = a[LLH] - b[LLH]
+    turn = (Rotation.from_quat(a[QUATERNION]) * Rotation.from_quat(b[QUATERNION]).inv()).as_rotvec()
+    place = (dlon * transverse * np.cos(b[0]), dlat * meridian, up)
+    return np.concatenate((place, a[VELOCITY] - b[VELOCITY], turn, a[10:] - b[10:]))
+
+
+def random_covariance(seed: int, scale: Floats) -> Floats:
+    """A full (n, n) covariance whose sigmas are about scale (n,)."""
+    root = np.random.default_rng(seed).standard_normal((len(scale), len(scale)))
+    result: Floats = np.outer(scale, scale) * (root @ root.T / len(scale) + 0.1 * np.eye(len(scale)))
+    return result

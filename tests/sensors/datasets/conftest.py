@@ -36,7 +36,7 @@ def synthetic_drive(seconds: float = 150.0, late_s: float = 0.0, ahead_m: float 
     axle = np.cumsum(speed[:, None] * forward, axis=0) * 0.001
     p = axle + ahead_m * forward
     velocity = np.gradient(p, 0.001, axis=0)
-    accel = np.gradient(velocity, 0.001, axis=0) + [0.0, 0.0, 9.80665]
+    accel = np.gradient(velocity, 0.001, axis=0) + np.array([0.0, 0.0, 9.80665])
     R_body_imu = Rotation.from_euler("ZYX", [172.0, -6.0, 3.0], degrees=True).as_matrix()
     R_imu_enu = (Rotation.from_euler("z", yaw[:, None]) * Rotation.from_matrix(R_body_imu)).inv()
     f = R_imu_enu.apply(accel)
