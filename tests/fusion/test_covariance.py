@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from fusion.config import FusionConfig
 from fusion.covariance import Noise, coast, propagate, transition
 from fusion.events import OUTPUT
+from fusion.filter import Localizer
 from fusion.run import run
 from fusion.state import A_S, E_ATTITUDE, E_POSITION, E_VELOCITY, ERROR_SIZE, ROW, covariance
 from fusion.timeline import noise_of
@@ -87,16 +88,19 @@ def van_loan(F: Floats, G: Floats, span: float) -> Floats:
 
 def test_process_noise_is_the_integral_of_white_noise() -> None:
     """Each block of Q against van Loan's integral for a constant force; the leading order is what is kept."""
-    span, f = 0.1, np.array([1.0, -2.0, 9.8])
+    span, f, noise = 0.1, np.array([1.0, -2.0, 9.8]), noise_of(Vehicle().imu, 1.0)
     F = np.zeros((9, 9))
     F[0:3, 3:6] = np.eye(3)
     F[3:6, 6:9] = [[0, f[2], -f[1]], [-f[2], 0, f[0]], [f[1], -f[0], 0]]
-    G = np.diag(np.repeat([0.0, NOISE.accel_psd, NOISE.gyro_psd], 3))
+    G = np.diag(np.repeat([0.0, noise.accel_psd, noise.gyro_psd], 3))
     expected = van_loan(F, G, span)
-    Q = plain(np.zeros((15, 15)), np.eye(15), f * span, span, NOISE)[:9, :9]
+    Q = plain(np.zeros((15, 15)), np.eye(15), f * span, span, noise)[:9, :9]
     sigma = np.sqrt(np.diag(expected))
-    # left out: tilt noise that reaches velocity, (g t)^2 qg / 3 qa = 0.3 %, and what follows from it
-    assert np.abs((Q - expected) / np.outer(sigma, sigma)).max() < 5e-3
+    missing = np.abs((Q - expected) / np.outer(sigma, sigma))
+    # left out: position against attitude, a correlation of g t sqrt(qg / 12 qa) = 1 %
+    assert missing.max() < 0.011
+    missing[:3, 6:] = missing[6:, :3] = 0.0
+    assert missing.max() < 1e-3  # and tilt noise that reaches velocity, (g t)^2 qg / 3 qa
 
 
 @pytest.mark.parametrize("hz", [200, 400])
@@ -154,10 +158,8 @@ def test_p_stays_symmetric_and_positive_definite_for_an_hour() -> None:
     assert states.sigma[60:, :3].max() < 30.0
 
 
-def test_whole_covariance_is_positive_definite_after_an_hour() -> None:
-    """The full 15 x 15, at its end, through the streaming filter that shows it."""
-    from fusion.filter import Localizer
-
+def test_whole_covariance_is_positive_definite_after_ten_minutes() -> None:
+    """The full 15 x 15 at its end, through the streaming filter, which shows it."""
     log = simulate(600.0, 12, scenarios.load("demo"))
     localizer = Localizer(log.vehicle, log.map_frame, FusionConfig())
     for record in (log.gnss, log.gnss_velocity, log.pose_fixes, log.imu):
@@ -178,7 +180,7 @@ def test_coasting_does_not_depend_on_how_a_gap_is_split(parts: int) -> None:
     for _ in range(parts):
         coast(split, 3.0 / parts, 2.0, 0.3)
     assert np.abs(whole - split).max() < 1e-9 * np.abs(whole).max()
-    assert np.abs(whole - whole.T).max() < 1e-12 * np.abs(whole).max()
+    assert np.abs(whole[:, :15] - whole[:, :15].T).max() < 1e-12 * np.abs(whole).max()
 
 
 def test_events_inside_a_gap_do_not_change_where_it_ends() -> None:
