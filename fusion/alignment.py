@@ -112,7 +112,7 @@ class Aligner:
             return None
         g, f = gyro[first:last], accel[first:last]
         quiet = float(np.linalg.norm(f, axis=1).var()) < self.par.still_accel_var
-        quiet = quiet and bool((g.var(axis=0) < self.par.still_rate_var).all())
+        quiet = quiet and float(g[:, 2].var()) < self.par.still_rate_var
         slow = all(t_ns - v.t_ns > 1e9 or np.linalg.norm(v.value) < 0.3 for v in self.velocities)
         return _Window(g.mean(axis=0), f.mean(axis=0), quiet and slow, (t[last - 1] - t[first]) * 1e-9)
 

@@ -77,16 +77,16 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Below this speed the non-holonomic update waits, m/s."""
     still_window_s: float = 1.0
     """Window over which the IMU must be quiet, s."""
-    still_accel: float = 0.15
+    still_accel: float = 0.25
     """Largest standard deviation of the acceleration's norm at rest, m/s^2."""
-    still_rate_deg: float = 0.5
-    """Largest standard deviation of each rate at rest, deg/s."""
-    still_max_speed: float = 0.1
+    still_rate_deg: float = 0.3
+    """Largest standard deviation of the yaw rate at rest (idling shakes the other two), deg/s."""
+    still_max_speed: float = 0.3
     """Above this estimated speed (plus three sigmas) the vehicle is not taken to stand, m/s."""
-    zero_velocity_sigma: float = 0.02
+    zero_velocity_sigma: float = 0.05
     """Velocity at rest, m/s."""
     zero_rate_sigma_deg: float = 0.1
-    """Turn rate at rest, deg/s."""
+    """Turn rate at rest, besides the gyro's noise, deg/s."""
     wheel: bool = True
     """Apply wheel speeds."""
 

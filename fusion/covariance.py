@@ -4,7 +4,6 @@ Between two uses of P (a measurement, a recorded state) the transition Phi is ac
 and the attitude, as in preintegration; P' = Phi P Phi' + Q costs one product per use instead of one per IMU sample.
 """
 
-import math
 from typing import NamedTuple
 
 from fusion._linalg import Matrix, Vector, cross
@@ -17,7 +16,11 @@ Scratch = tuple[Floats, Floats, Floats]
 
 
 class Noise(NamedTuple):
-    """Process noise: gyro (rad/s)^2/Hz, accelerometer (m/s^2)^2/Hz; variances and 1/tau (1/s) of drifting biases."""
+    """Process noise: gyro (rad/s)^2/Hz, accelerometer (m/s^2)^2/Hz; variances and 1/tau (1/s) of drifting biases.
+
+    A bias is a turn-on constant, which nothing but measurements makes known, plus a Gauss-Markov drift. One state holds
+    both: a random walk with the drift's driving noise, 2 var / tau, so that sigma never falls by waiting.
+    """
 
     gyro_psd: float
     accel_psd: float
@@ -51,7 +54,7 @@ def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, dt: float) -> N
 
 @kernel()
 def transition(nav: Floats, earth: Floats, acc: Floats, span: float, phi: Floats) -> None:
-    """Write phi (9, 16), the upper rows of the transition over the accumulated span; biases decay on their own."""
+    """Write phi (9, 16), the upper rows of the transition over the accumulated span; biases stay as they are."""
     slow_dynamics(nav, earth, span, phi)
     for i in range(3):
         phi[i, 3 + i] += span
@@ -100,18 +103,14 @@ def propagate(
     for k in range(15):
         for i in range(9):
             Mt[k, i] = M[i, k]
-    decay = math.exp(-noise.bias_rate * span)
     for i in range(9):
         for j in range(9, 15):
-            P[i, j] = P[j, i] = M[i, j] * decay
-    for i in range(9, 15):
-        for j in range(9, 15):
-            P[i, j] *= decay * decay
+            P[i, j] = P[j, i] = M[i, j]
     _product(phi, Mt, M)
     for i in range(9):
         for j in range(i + 1):
             P[i, j] = P[j, i] = M[i, j]
-    _add_noise(P, acc, noise, span, 1.0 - decay * decay)
+    _add_noise(P, acc, noise, span)
     elapsed[0] = 0.0
     for i in range(ACC_SIZE):
         for j in range(3):
@@ -119,17 +118,17 @@ def propagate(
 
 
 @kernel()
-def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float, refilled: float) -> None:
+def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float) -> None:
     """Q of white noise integrated over the span (van Loan's integral, to the leading order of each block)."""
-    qa, qg = noise.accel_psd * span, noise.gyro_psd * span
+    qa, qg, drift = noise.accel_psd * span, noise.gyro_psd * span, 2.0 * noise.bias_rate * span
     for i in range(3):
         P[i, i] += qa * span * span / 3.0
         P[i, 3 + i] += 0.5 * qa * span
         P[3 + i, i] += 0.5 * qa * span
         P[3 + i, 3 + i] += qa
         P[6 + i, 6 + i] += qg
-        P[9 + i, 9 + i] += noise.gyro_bias_var * refilled
-        P[12 + i, 12 + i] += noise.accel_bias_var * refilled
+        P[9 + i, 9 + i] += noise.gyro_bias_var * drift
+        P[12 + i, 12 + i] += noise.accel_bias_var * drift
     # velocity against attitude: -[s]x qg / 2
     half = 0.5 * qg
     x, y, z = half * acc[A_S, 0], half * acc[A_S, 1], half * acc[A_S, 2]

@@ -14,7 +14,7 @@ _ZERO_VELOCITY = int(Sensor.ZERO_VELOCITY)
 _NON_HOLONOMIC = int(Sensor.NON_HOLONOMIC)
 
 StillLimits = tuple[int, float, float]
-"""Window ns, variance of the specific force's norm (m/s^2)^2 and of each rate (rad/s)^2."""
+"""Window ns, variance of the specific force's norm (m/s^2)^2 and of the yaw rate (rad/s)^2."""
 
 
 @kernel()
@@ -27,15 +27,15 @@ def clear(a: Floats) -> None:
 
 @kernel()
 def still(
-    ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, sums: Floats, limits: StillLimits, now: int
+    ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, recent: Floats, limits: StillLimits, now: int
 ) -> tuple[bool, float, float, float]:
     """Whether the IMU was quiet over the window before now, and its mean rate since the last motion tick, rad/s.
 
-    sums (3, 3): scratch for the rates, their squares, and the rates since the tick.
+    recent (3,): scratch for the sum of the rates since the tick.
     """
     count = clock[C_COUNT]
-    clear(sums)
-    norm, norm2 = 0.0, 0.0
+    recent[0] = recent[1] = recent[2] = 0.0
+    norm, norm2, turn, turn2 = 0.0, 0.0, 0.0, 0.0
     n, fresh = 0, 0
     oldest = now
     for back in range(min(count, RING_SIZE)):
@@ -45,24 +45,21 @@ def still(
             break
         oldest = t
         n += 1
-        for k in range(3):
-            rate = ring[i, k] - nav[10 + k]
-            sums[0, k] += rate
-            sums[1, k] += rate * rate
+        rate = ring[i, 2] - nav[12]
+        turn += rate
+        turn2 += rate * rate
         if t > clock[C_TICK]:
             fresh += 1
             for k in range(3):
-                sums[2, k] += ring[i, k]
+                recent[k] += ring[i, k]
         f2 = ring[i, 3] ** 2 + ring[i, 4] ** 2 + ring[i, 5] ** 2
         norm += np.sqrt(f2)
         norm2 += f2
     if n < 5 or fresh == 0 or now - oldest < 0.8 * limits[0]:
         return False, 0.0, 0.0, 0.0
     quiet = norm2 / n - (norm / n) ** 2 < limits[1]
-    for k in range(3):
-        mean = sums[0, k] / n
-        quiet = quiet and sums[1, k] / n - mean * mean < limits[2]
-    return quiet, sums[2, 0] / fresh, sums[2, 1] / fresh, sums[2, 2] / fresh
+    quiet = quiet and turn2 / n - (turn / n) ** 2 < limits[2]
+    return quiet, recent[0] / fresh, recent[1] / fresh, recent[2] / fresh
 
 
 @kernel(inline="always")
@@ -77,7 +74,7 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     quiet = False
     if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4] + P[5, 5]):
         limits = (par.still_window_ns, par.still_accel_var, par.still_rate_var)
-        quiet, w0, w1, w2 = still(core.ring, core.ring_t, core.clock, nav, core.L, limits, now)
+        quiet, w0, w1, w2 = still(core.ring, core.ring_t, core.clock, nav, residual, limits, now)
         if quiet:
             _zero_rate(core, par, (w0, w1, w2))
     core.clock[C_TICK] = now

@@ -51,8 +51,9 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         first, second, third = (float(chi2.ppf(gates.probability, dof)) for dof in (1, 2, 3))
     else:
         first = second = third = np.inf
+    noise = noise_of(vehicle.imu, config.imu.noise_scale)
     return Parameters(
-        noise=noise_of(vehicle.imu, config.imu.noise_scale),
+        noise=noise,
         increments=vehicle.imu.samples == "increment",
         max_gap_ns=round(config.imu.max_gap_s * 1e9),
         coast_accel=config.imu.coast_accel,
@@ -77,7 +78,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         still_rate_var=float(np.radians(motion.still_rate_deg) ** 2),
         still_max_speed=motion.still_max_speed,
         zero_velocity_var=motion.zero_velocity_sigma**2,
-        zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2),
+        zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2) + noise.gyro_psd * motion.rate_hz,
     )
 
 

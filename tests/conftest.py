@@ -13,7 +13,8 @@ PACKAGES = ("sensors", "egovm", "fusion", "replay")
 
 def kernel_sources() -> list[Path]:
     """Files with numba kernels and the project's files that they import functions and constants from."""
-    found = {path for name in PACKAGES for path in (ROOT / name).rglob("*.py") if "@njit" in path.read_text()}
+    python = [path for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
+    found = {path for path in python if re.search(r"^@(njit|kernel)\b", path.read_text(), re.MULTILINE)}
     for path in list(found):
         for module in re.findall(rf"^from ((?:{'|'.join(PACKAGES)})\S*) import", path.read_text(), re.MULTILINE):
             plain = ROOT / (module.replace(".", "/") + ".py")

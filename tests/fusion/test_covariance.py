@@ -47,8 +47,7 @@ def plain(P: Floats, phi: Floats, force: Floats, span: float, noise: Noise) -> F
     Q[E_ATTITUDE, E_ATTITUDE] = np.eye(3) * qg
     Q[E_VELOCITY, E_ATTITUDE] = minus_skew * qg / 2
     Q[E_ATTITUDE, E_VELOCITY] = minus_skew.T * qg / 2
-    refilled = 1 - np.exp(-2 * noise.bias_rate * span)
-    Q[9:, 9:] = np.diag(np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3)) * refilled
+    Q[9:, 9:] = np.diag(np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3)) * 2 * noise.bias_rate * span
     result: Floats = phi @ P @ phi.T + Q
     return result
 
@@ -63,7 +62,7 @@ def test_propagation_equals_plain_matrices() -> None:
     assert core.span[0] == pytest.approx(0.1, abs=1e-12)
     upper = np.zeros((9, ROW))
     transition(core.nav, core.earth, core.acc, core.span[0], upper)
-    phi = np.diag(np.repeat([1.0, np.exp(-NOISE.bias_rate * 0.1)], [9, 6]))
+    phi = np.eye(15)
     phi[:9] = upper[:, :15]
     expected = plain(P, phi, core.acc[A_S].copy(), 0.1, NOISE)
     propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), NOISE)
