@@ -16,7 +16,8 @@ from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
 from fusion.result import Reason, Sensor
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, Core, Floats
-from sensors._kernels import kernel, radii
+from sensors._kernels import radii
+from sensors.kernel import kernel
 
 _GNSS_POSITION = int(Sensor.GNSS_POSITION)
 _GNSS_VELOCITY = int(Sensor.GNSS_VELOCITY)

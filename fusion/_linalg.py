@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sensors._kernels import kernel
+from sensors.kernel import kernel
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

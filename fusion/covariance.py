@@ -9,7 +9,7 @@ from typing import NamedTuple
 from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
 from fusion.state import A_S, A_U, ACC_SIZE, ROW, Floats
-from sensors._kernels import kernel
+from sensors.kernel import kernel
 
 Scratch = tuple[Floats, Floats, Floats]
 """phi (9, 16), M (9, 16) and Mt (15, 16) of the core."""

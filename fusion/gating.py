@@ -5,7 +5,7 @@ import math
 from fusion._linalg import Quaternion, Vector, exp_q, multiply, normalize
 from fusion.mechanization import refresh
 from fusion.state import G_COS, G_HEIGHT, G_MERIDIAN, G_SIN, G_TRANSVERSE, ROW, Floats
-from sensors._kernels import kernel
+from sensors.kernel import kernel
 
 FAR_M = 10.0
 """A correction of more than this asks for new radii of curvature."""

@@ -9,7 +9,8 @@ import math
 
 from fusion._linalg import Matrix, Vector, cross, matvec, matvec_t
 from fusion.state import Floats
-from sensors._kernels import EARTH_RATE, kernel, radii
+from sensors._kernels import EARTH_RATE, radii
+from sensors.kernel import kernel
 
 Pair = tuple[float, float]
 

@@ -14,7 +14,8 @@ from fusion.state import (
     G_UP,
     Floats,
 )
-from sensors._kernels import EARTH_RATE, gravity_enu, kernel, radii
+from sensors._kernels import EARTH_RATE, gravity_enu, radii
+from sensors.kernel import kernel
 
 MAX_AGE = 5
 """Radii of curvature and gravity are refreshed after so many steps."""

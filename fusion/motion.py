@@ -8,7 +8,8 @@ from fusion.gating import correct, innovate, whiten
 from fusion.measurements import body_velocity
 from fusion.result import Sensor
 from fusion.state import C_COUNT, C_TICK, RING_SIZE, Core, Floats, Nanoseconds
-from sensors._kernels import EARTH_RATE, kernel
+from sensors._kernels import EARTH_RATE
+from sensors.kernel import kernel
 
 _ZERO_VELOCITY = int(Sensor.ZERO_VELOCITY)
 _NON_HOLONOMIC = int(Sensor.NON_HOLONOMIC)

@@ -1,14 +1,15 @@
 """Loops over a reference (numba): arrays in and out."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sensors.kernel import kernel
 
 Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def sample_track(
     known: Nanoseconds, p: Floats, t_ns: Nanoseconds, gap_ns: int, base_ns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_], Floats, Floats]:
@@ -55,7 +56,7 @@ def sample_track(
     return left, inside, position, velocity
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hermite(known: Nanoseconds, p: Floats, row: int, t: int, gap_ns: int, out: Floats) -> None:
     """Into out (3,): the cubic between row and the next, its end velocities those of parabolas through three rows.
 

@@ -1,16 +1,8 @@
 """Scalar WGS-84 formulas for loops (numba): radii of curvature, gravity, earth rate. Arrays and floats only."""
 
 import math
-from functools import partial
 
-from numba import njit
-
-kernel = partial(njit, cache=True, _nrt=False)
-"""Decorator ``@kernel()`` of functions that allocate nothing: numba then counts no references to their arrays.
-
-Counting is atomic and took most of the filter's time (0.7 us a call with thirty arrays). A kernel that allocates does
-not compile under it.
-"""
+from sensors.kernel import kernel
 
 WGS84_A = 6_378_137.0
 """Semi-major axis, m."""

@@ -39,5 +39,4 @@ def utc_from_gps_week(week: NDArray[np.int64], seconds_of_week: NDArray[np.float
 
 def seconds(t_ns: NDArray[np.int64], origin_ns: int) -> NDArray[np.float64]:
     """Seconds since an origin, as float64 (exact to a nanosecond over 100 days)."""
-    result: NDArray[np.float64] = (np.asarray(t_ns, np.int64) - origin_ns) * 1e-9
-    return result
+    return np.asarray((np.asarray(t_ns, np.int64) - origin_ns) * 1e-9, np.float64)

@@ -58,12 +58,9 @@ class _Columns:
     def _set(self, name: str, shape: tuple[int, ...], dtype: type = np.float64, *, missing: bool = False) -> None:
         """Check one column against (N, *shape) and store it contiguous; missing: NaN rows are allowed."""
         given = getattr(self, name)
-        if given is None:
-            array = np.full((len(self.t_ns), *shape), np.nan)
-        else:
-            array = np.ascontiguousarray(given, dtype=dtype)
         label = f"{type(self).__name__}.{name}"
         wanted = (len(self.t_ns), *shape)
+        array = np.full(wanted, np.nan) if given is None else np.ascontiguousarray(given, dtype=dtype)
         if array.shape != wanted:
             raise EgolocError(f"{label}: expected shape {wanted}, got {array.shape}")
         if dtype is np.float64 and (np.isinf(array).any() if missing else not np.isfinite(array).all()):

@@ -1,8 +1,8 @@
 """`egoloc bench replay`: from an MCAP log to metrics.json, against the clock, over logs of growing length.
 
-The log: simulated, 100 Hz IMU and reference, 10 Hz GNSS (position and velocity) and pose fixes, zstd. Timed: the whole of
-``replay_file`` (hashing, reading, fusing, scoring, writing the run folder) after one call that warms up; imports are not
-counted. Peak memory is that of a fresh process that replays the first length once.
+The log: simulated, 100 Hz IMU and reference, 10 Hz GNSS (position and velocity) and pose fixes, zstd. Timed: the whole
+of ``replay_file`` (hashing, reading, fusing, scoring, writing the run folder) after one call that warms up; imports are
+not counted. Peak memory is that of a fresh process that replays the first length once.
 """
 
 import resource
@@ -38,7 +38,7 @@ def run(repeats: int = 5, hours: Sequence[float] = (1.0,)) -> dict[str, Any]:
                 rows.append(row(name, "peak_memory_mb", [_peak_memory_mb(path, out)]))
     first = per_hour[hours[0]]
     ratios = {f"seconds per hour, {length:g} h to {hours[0]:g} h": per_hour[length] / first for length in hours[1:]}
-    facts = {"imu_hz": 100, "reference_hz": 100, "gnss_hz": 10, "pose_hz": 10, "compression": "zstd", "repeats": repeats}
+    facts = {"imu_hz": 100, "reference_hz": 100, "gnss_hz": 10, "pose_hz": 10, "log": "zstd", "repeats": repeats}
     return {"bench": "replay", "rows": rows, "ratios": ratios, "conditions": conditions(["numba", "numpy"], **facts)}
 
 

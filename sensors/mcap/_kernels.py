@@ -4,9 +4,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from sensors.kernel import kernel
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -18,7 +20,7 @@ MESSAGE_HEADER = 22
 _MESSAGE = 5
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(allocates=True, nogil=True, inline="always")
 def _int64(buffer: Bytes, at: int) -> Any:
     value = np.int64(0)
     for k in range(8):
@@ -45,7 +47,7 @@ def _move8(_context: Any, target: Any, target_at: Any, source: Any, source_at: A
     return signature, generate
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(allocates=True, nogil=True, inline="always")
 def _copy(target: Bytes, target_at: int, source: Bytes, source_at: int, size: int) -> None:
     words = size >> 3
     for k in range(words):
@@ -54,7 +56,7 @@ def _copy(target: Bytes, target_at: int, source: Bytes, source_at: int, size: in
         target[target_at + k] = source[source_at + k]
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True, nogil=True)
 def scan(
     buffer: Bytes,
     cursor: int,
@@ -89,7 +91,7 @@ def scan(
     return count, cursor, unknown
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True, nogil=True)
 def run_of_messages(buffer: Bytes, cursor: int, stop: int) -> int:
     """Where the run of whole message records that starts at cursor ends (at most a record beyond stop)."""
     total = len(buffer)
@@ -101,7 +103,7 @@ def run_of_messages(buffer: Bytes, cursor: int, stop: int) -> int:
     return cursor
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True, nogil=True)
 def gather(
     buffer: Bytes,
     at: Ints,
@@ -143,7 +145,7 @@ def gather(
     return count, filled
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True, nogil=True)
 def scatter(rows: Bytes, starts: Ints, out: Bytes) -> None:
     """Copy each of rows (N, size) to its place in out: (N,) starts."""
     flat = rows.reshape(-1)

@@ -8,15 +8,15 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sensors._kernels import EARTH_RATE, gravity_enu, radii
+from sensors.kernel import kernel
 
 Floats = NDArray[np.float64]
 
 
-@njit(cache=True, inline="always")
+@kernel(allocates=True, inline="always")
 def _value(c: Any, z: float) -> float:
     """Horner's rule."""
     p = 0.0
@@ -25,7 +25,7 @@ def _value(c: Any, z: float) -> float:
     return p
 
 
-@njit(cache=True, inline="always")
+@kernel(allocates=True, inline="always")
 def _with_slope(c: Any, z: float) -> tuple[float, float]:
     """Value and derivative with respect to z."""
     p, d = 0.0, 0.0
@@ -35,7 +35,7 @@ def _with_slope(c: Any, z: float) -> tuple[float, float]:
     return p, d
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def integrate_place(
     shape: Floats, llh: Floats, step: float, nodes: Floats, weights: Floats, at_nodes: Floats, powers: Floats
 ) -> Floats:
@@ -86,7 +86,7 @@ def integrate_place(
     return table
 
 
-@njit(cache=True, inline="always")
+@kernel(allocates=True, inline="always")
 def _inertial(shape: Any, place: Any, z: float, slope: float) -> tuple[float, float, float, float, float, float]:
     """Rate against inertial space, rad/s, and specific force, m/s^2, in body axes (Groves 2013, Eq. 5.44 and 5.53)."""
     v, dv = _with_slope(shape[0], z)
@@ -120,7 +120,7 @@ def _inertial(shape: Any, place: Any, z: float, slope: float) -> tuple[float, fl
     return droll + w1, cr * w2 + sr * w3, cr * w3 - sr * w2, f1, cr * f2 + sr * f3, cr * f3 - sr * f2
 
 
-@njit(cache=True, inline="always")
+@kernel(allocates=True, inline="always")
 def _locate(t: float, start: float, step: float, count: int) -> tuple[int, float]:
     """Interval that holds a time, and z in it."""
     u = (t - start) / step
@@ -128,7 +128,7 @@ def _locate(t: float, start: float, step: float, count: int) -> tuple[int, float
     return k, 2.0 * (u - k) - 1.0
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def inertial_means(
     shape: Floats,
     place: Floats,
@@ -153,14 +153,14 @@ def inertial_means(
             accel[i, 2] += weights[g] * f3
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def first_order(x: Floats, a: float) -> None:
     """x[k] += a x[k-1], in place."""
     for k in range(1, len(x)):
         x[k] += a * x[k - 1]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def kinematics(
     shape: Floats, place: Floats, start: float, step: float, t: Floats, llh: Floats, vel_enu: Floats, q_enu_body: Floats
 ) -> None:

@@ -207,3 +207,15 @@ def test_noise_scale_multiplies_the_white_noise_only() -> None:
     # 0.1 deg/sqrt(h) is 0.1 deg after an hour
     assert np.degrees(np.sqrt(one.gyro_psd * 3600)) == pytest.approx(spec.gyro_noise_deg_per_sqrt_h)
     assert np.sqrt(one.accel_psd * 3600) == pytest.approx(spec.accel_noise_m_per_s_per_sqrt_h)
+
+
+def test_waiting_makes_no_bias_known() -> None:
+    """Without measurements the sigmas of the biases only grow, by the drift's driving noise."""
+    truth, vehicle = city(600.0), Vehicle()
+    t = grid(truth, 600.0, 20)
+    imu = exact_imu(truth, t, vehicle)
+    core = core_at(nav_of(truth.at(t[:1])), imu, np.diag(SIGMAS**2))
+    go(core, imu, vehicle)
+    noise = noise_of(vehicle.imu, FREE.imu.noise_scale)
+    grown = SIGMAS[9:] ** 2 + np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3) * 2 * 600 * noise.bias_rate
+    assert np.diag(covariance(core))[9:] == pytest.approx(grown, rel=1e-9)

@@ -1,0 +1,151 @@
+"""filterpy as an independent oracle: the same Phi, Q, H and R give the same states and covariances."""
+
+import msgspec
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from fusion.config import Gates, GnssModel
+from fusion.covariance import propagate, transition
+from fusion.events import OUTPUT
+from fusion.gating import correct, innovate, whiten
+from fusion.state import A_S, E_ATTITUDE, ERROR_SIZE, LLH, ROW, Core, covariance
+from fusion.timeline import noise_of
+from sensors.records import GnssFix, GnssVelocity, Log
+from sensors.simulate.drive import DriveConfig, Start, city_truth
+from sensors.simulate.gnss import displaced
+from sensors.vehicle import ImuSpec, Vehicle
+from tests.fusion.free import FREE, Floats, core_at, exact_imu, go, go_with, grid, minus, nav_of, random_covariance
+from tests.fusion.test_covariance import plain
+
+NEAR_ZERO = DriveConfig(start=Start(latitude_deg=0.2, longitude_deg=0.2, height_m=50.0))
+"""Close to latitude and longitude zero doubles resolve the place to 1e-12 m."""
+KNOWN_ATTITUDE = ImuSpec(gyro_noise_deg_per_sqrt_h=0.0, gyro_bias_instability_deg_per_h=0.0)
+"""Without gyro errors the attitude is known and the filter's problem is linear in position, velocity and bias."""
+CONFIG = msgspec.structs.replace(
+    FREE,
+    gates=Gates(use=False),
+    gnss=GnssModel(
+        inflation=1.0,
+        velocity_inflation=1.0,
+        sigma_floor_horizontal_m=0.0,
+        sigma_floor_vertical_m=0.0,
+        sigma_floor_velocity=0.0,
+    ),
+)
+POSITION_SIGMA, VELOCITY_SIGMA = 1e-3, 1e-3
+
+
+def step(core: Core, vehicle: Vehicle) -> tuple[Floats, Floats]:
+    """Phi and Q (15, 15) over what the core has accumulated, in plain numpy; the core's P goes along."""
+    noise = noise_of(vehicle.imu, CONFIG.imu.noise_scale)
+    span, upper = float(core.span[0]), np.zeros((9, ROW))
+    transition(core.nav, core.earth, core.acc, span, upper)
+    phi = np.eye(ERROR_SIZE)
+    phi[:9] = upper[:, :ERROR_SIZE]
+    Q = plain(np.zeros((ERROR_SIZE, ERROR_SIZE)), phi, core.acc[A_S].copy(), span, noise)
+    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), noise)
+    return phi, Q
+
+
+def test_linear_case_equals_filterpy() -> None:
+    """100 s of GNSS positions and velocities at 10 Hz: filterpy estimates the deviation from a free inertial run.
+
+    Deviations are millimetres, so that what is not linear (deviation^2 / earth's radius) stays far below 1e-9.
+    """
+    vehicle, seconds = Vehicle(imu=KNOWN_ATTITUDE), 100.0
+    truth = city_truth(seconds, 6, NEAR_ZERO)
+    t = grid(truth, seconds, 100)
+    imu, every = exact_imu(truth, t, vehicle), t[10::10]
+    motion, rng = truth.at(every), np.random.default_rng(3)
+    place_error = POSITION_SIGMA * rng.standard_normal((len(every), 3))
+    velocity_error = VELOCITY_SIGMA * rng.standard_normal((len(every), 3))
+    cov = np.broadcast_to(np.diag([1.0, 2.0, 3.0]), (len(every), 3, 3))
+    status = np.full(len(every), 4, np.int8)
+    gnss = GnssFix(every, every, displaced(motion.llh, place_error), cov * POSITION_SIGMA**2, status)
+    velocity = GnssVelocity(every, every, motion.vel_enu + velocity_error, cov * VELOCITY_SIGMA**2)
+
+    P = np.diag(np.repeat([1e-3, 1e-3, 0.0, 0.0, 1e-4], 3) ** 2)
+    first = nav_of(truth.at(t[:1]))
+    filtered = core_at(first, imu, P)
+    rec, _ = go(filtered, imu, vehicle, CONFIG, Log(gnss=gnss, gnss_velocity=velocity))
+
+    oracle = KalmanFilter(dim_x=ERROR_SIZE, dim_z=6)
+    oracle.x, oracle.P, oracle.H = np.zeros(ERROR_SIZE), P.copy(), np.eye(6, ERROR_SIZE)
+    oracle.R = np.kron(np.diag([POSITION_SIGMA**2, VELOCITY_SIGMA**2]), cov[0])
+    free = core_at(first, imu)
+    states, sigmas = [], []
+    for k, time in enumerate(every):
+        go_with(free, imu[imu.t_ns <= time], vehicle, np.empty(0, np.int64), OUTPUT)
+        phi, Q = step(free, vehicle)
+        oracle.predict(F=phi, Q=Q)
+        there = np.concatenate((gnss.llh[k], velocity.vel_enu[k], free.nav[6:]))
+        oracle.update(minus(there, free.nav)[:6])
+        states.append(minus(rec.nav[k], free.nav) - oracle.x)
+        sigmas.append(rec.sigma_state[k] - np.sqrt(np.diag(oracle.P)))
+    assert rec.filled[0] == len(every)
+    difference = np.abs(states).max(axis=0)
+    print(
+        f"largest difference to filterpy: position {difference[:3].max():.1e} m, velocity {difference[3:6].max():.1e}"
+    )
+    assert difference.max() < 1e-9
+    assert np.abs(oracle.x[:3]).max() > 1e-6  # the oracle did move
+    assert np.abs(sigmas).max() < 1e-12
+    assert np.abs(covariance(filtered) - oracle.P).max() < 1e-9 * np.abs(oracle.P).max()
+
+
+@pytest.mark.parametrize("dof", [1, 2, 3])
+def test_updates_equal_filterpy_over_a_drive(dof: int) -> None:
+    """All 15 states, attitude included, 500 updates: each correction and the covariance; both get the same reset."""
+    vehicle, seconds = Vehicle(), 50.0
+    truth = city_truth(seconds, 7, DriveConfig())
+    t = grid(truth, seconds, 100)
+    imu = exact_imu(truth, t, vehicle)
+    sigma = np.repeat([1.0, 0.3, 0.02, 1e-4, 0.05], 3)
+    core = core_at(nav_of(truth.at(t[:1])), imu, random_covariance(8, sigma))
+    oracle = KalmanFilter(dim_x=ERROR_SIZE, dim_z=dof)
+    oracle.P = covariance(core).copy()
+    rng = np.random.default_rng(9)
+    largest = np.zeros(2)
+    for time in t[10::10]:
+        go_with(core, imu[imu.t_ns <= time], vehicle, np.empty(0, np.int64), OUTPUT)
+        phi, Q = step(core, vehicle)
+        oracle.x = np.zeros((ERROR_SIZE, 1))
+        oracle.predict(F=phi, Q=Q)
+        H = rng.standard_normal((dof, ERROR_SIZE)) / sigma * (rng.random((dof, ERROR_SIZE)) < 0.4)
+        root = rng.standard_normal((dof, dof))
+        R = root @ root.T + 0.5 * np.eye(dof)
+        z = rng.standard_normal(dof)
+        oracle.update(z[:, None], R=R, H=H)
+        dx, nis = updated(core, H, R, z)
+        scale = np.sqrt(np.diag(oracle.P))
+        largest = np.maximum(largest, (np.abs(dx - oracle.x[:, 0]) / scale).max())
+        y = np.linalg.solve(oracle.S, z)
+        assert nis == pytest.approx(float(z @ y), rel=1e-9)
+        oracle.P = turned(oracle.P, dx[E_ATTITUDE])
+        difference = np.abs(covariance(core) - oracle.P) / np.outer(scale, scale)
+        assert difference.max() < 1e-9
+    print(f"{dof} rows: largest correction difference {largest[0]:.1e} sigma")
+    assert largest[0] < 1e-9
+    assert np.isfinite(core.nav).all()
+    assert (np.abs(core.nav[LLH]) < 10 * truth.at(t[:1]).llh[0]).all()
+
+
+def updated(core: Core, H: Floats, R: Floats, z: Floats) -> tuple[Floats, float]:
+    """One update of the core by the kernels: the correction (15,) and the normalized innovation squared."""
+    dof = len(z)
+    core.H[:], core.R[:], core.residual[:] = 0.0, 0.0, 0.0
+    core.H[:dof, :ERROR_SIZE], core.R[:dof, :dof], core.residual[:dof] = H, R, z
+    assert innovate(core.P, core.H, core.W, dof, core.R, core.L)
+    nis = whiten(dof, core.residual, core.L)
+    correct(core.nav, core.earth, core.P, core.W, core.dx, core.residual)
+    return core.dx[:ERROR_SIZE].copy(), nis
+
+
+def turned(P: Floats, angle: Floats) -> Floats:
+    """P after the reset of an attitude error (3,)."""
+    x, y, z = 0.5 * angle
+    G = np.eye(ERROR_SIZE)
+    G[E_ATTITUDE, E_ATTITUDE] += [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    result: Floats = G @ P @ G.T
+    return result
