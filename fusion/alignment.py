@@ -31,6 +31,8 @@ from sensors.vehicle import ImuSpec, Vehicle
 
 _DEG_PER_H = math.pi / 180.0 / 3600.0
 _MG = 9.80665e-3
+_LONGEST_BASELINE_S = 2.0
+"""Positions further apart give no velocity, s."""
 _HEIGHT_SIGMA_M = 1000.0
 """Height where no GNSS gives it: anywhere on earth's surface."""
 
@@ -71,12 +73,14 @@ class Aligner:
     vehicle: Vehicle
     config: FusionConfig
     par: Parameters
-    position: _Fix | None = None
+    positions: deque[_Fix] = field(default_factory=lambda: deque(maxlen=64))
     velocities: deque[_Fix] = field(default_factory=lambda: deque(maxlen=64))
     poses: deque[_Fix] = field(default_factory=lambda: deque(maxlen=2))
     rest: tuple[Floats, int] | None = None
     """Sum of mean rates over windows at rest and their number."""
     rest_until_ns: int = 0
+    _derived: bool = False
+    """Velocities are differences of positions."""
 
     def offer(
         self, t_ns: int, sensor: int, row: int, m: Measurements, imu: tuple[NDArray[np.int64], Floats, Floats]
@@ -84,8 +88,9 @@ class Aligner:
         """Take one measurement and the IMU samples (t, gyro, accel) up to its time; a state once it can be had."""
         window = self._window(t_ns, imu)
         if sensor == Sensor.GNSS_POSITION:
-            self.position = _Fix(t_ns, m.gnss_llh[row], m.gnss_cov[row])
+            self._take_position(_Fix(t_ns, m.gnss_llh[row], m.gnss_cov[row]))
         elif sensor == Sensor.GNSS_VELOCITY:
+            self._derived = False
             self.velocities.append(_Fix(t_ns, m.vel[row], m.vel_cov[row]))
         elif sensor == Sensor.POSE_FIX:
             value = np.append(m.pose_llh[row], m.pose_yaw[row])
@@ -93,13 +98,32 @@ class Aligner:
         if window is None:
             return None
         self._watch_rest(t_ns, window)
-        yaw, yaw_var = self._yaw(sensor, row, m)
+        yaw, yaw_var = self._yaw(t_ns, sensor, row, m)
         if yaw is None:
             return None
         velocity = self._velocity(t_ns, window)
         if velocity is None:
             return None
         return self._build(t_ns, Sensor(sensor), yaw, yaw_var, velocity, window)
+
+    def _take_position(self, fix: _Fix) -> None:
+        """Keep a position; where the receiver gives no velocity, the one over the best of the last baselines.
+
+        A short baseline shows the fixes' noise, a long one the acceleration in between (1 m/s^2): the smaller sum wins.
+        """
+        self.positions.append(fix)
+        if self.velocities and not self._derived and fix.t_ns - self.velocities[-1].t_ns <= 1e9:
+            return
+        best: _Fix | None = None
+        for older in self.positions:
+            dt = (fix.t_ns - older.t_ns) * 1e-9
+            if 0.0 < dt <= _LONGEST_BASELINE_S:
+                cov = (fix.cov + older.cov) / dt**2 + np.eye(3) * (0.5 * dt) ** 2
+                if best is None or cov[0, 0] < best.cov[0, 0]:
+                    best = _Fix(fix.t_ns, _enu_between(older.value, fix.value) / dt, cov)
+        if best is not None:
+            self._derived = True
+            self.velocities.append(best)
 
     def _window(self, t_ns: int, imu: tuple[NDArray[np.int64], Floats, Floats]) -> _Window | None:
         """Averages over (t - window, t]; None where the IMU does not cover it."""
@@ -113,7 +137,8 @@ class Aligner:
         g, f = gyro[first:last], accel[first:last]
         quiet = float(np.linalg.norm(f, axis=1).var()) < self.par.still_accel_var
         quiet = quiet and float(g[:, 2].var()) < self.par.still_rate_var
-        slow = all(t_ns - v.t_ns > 1e9 or np.linalg.norm(v.value) < 0.3 for v in self.velocities)
+        seen = [v for v in (*self.velocities, *self._pose_velocity()) if t_ns - v.t_ns <= 1e9]
+        slow = all(np.linalg.norm(v.value[:2]) < 0.3 + 2.0 * math.sqrt(v.cov[0, 0] + v.cov[1, 1]) for v in seen)
         return _Window(g.mean(axis=0), f.mean(axis=0), quiet and slow, (t[last - 1] - t[first]) * 1e-9)
 
     def _watch_rest(self, t_ns: int, window: _Window) -> None:
@@ -123,7 +148,7 @@ class Aligner:
             self.rest = (total + window.gyro, count + 1)
             self.rest_until_ns = t_ns + round(self.config.alignment.window_s * 1e9)
 
-    def _yaw(self, sensor: int, row: int, m: Measurements) -> tuple[float | None, float]:
+    def _yaw(self, t_ns: int, sensor: int, row: int, m: Measurements) -> tuple[float | None, float]:
         """Yaw from east and its variance, where this measurement shows it."""
         if sensor == Sensor.GNSS_YAW:
             return float(m.yaw[row]), float(m.yaw_var[row])
@@ -133,14 +158,35 @@ class Aligner:
             place = float(np.linalg.eigvalsh(cov[:2, :2])[-1])
             if cov[2, 2] <= limits[2] ** 2 and place <= max(limits[0], limits[1]) ** 2:
                 return float(m.pose_yaw[row]), float(cov[2, 2])
-        if sensor == Sensor.GNSS_VELOCITY:
-            east, north = m.vel[row, :2]
-            speed2 = float(east * east + north * north)
-            if speed2 >= self.config.alignment.min_course_speed**2:
-                across = float(np.array([-north, east]) @ m.vel_cov[row, :2, :2] @ np.array([-north, east])) / speed2
-                own = math.radians(self.config.alignment.course_sigma_deg) ** 2
-                return math.atan2(north, east), across / speed2 + own
+        if self.velocities and self.velocities[-1].t_ns == t_ns:
+            return self._course(self.velocities[-1])
         return None, 0.0
+
+    def _course(self, velocity: _Fix) -> tuple[float | None, float]:
+        """Direction of motion and its variance, where it is fast enough and known well enough."""
+        limits = self.config.alignment
+        east, north = velocity.value[:2]
+        speed2 = float(east * east + north * north)
+        if speed2 < limits.min_course_speed**2:
+            return None, 0.0
+        normal = np.array([-north, east])
+        variance = float(normal @ velocity.cov[:2, :2] @ normal) / speed2**2
+        if variance > math.radians(limits.max_course_sigma_deg) ** 2:
+            return None, 0.0
+        return math.atan2(north, east), variance + math.radians(limits.course_sigma_deg) ** 2
+
+    def _pose_velocity(self) -> list[_Fix]:
+        """Velocity between the last two pose fixes, where they are within a second: none or one."""
+        if len(self.poses) < 2:
+            return []
+        older, newer = self.poses
+        dt = (newer.t_ns - older.t_ns) * 1e-9
+        if not 0.0 < dt <= 1.0:
+            return []
+        cov = np.zeros((3, 3))
+        cov[:2, :2] = (older.cov[:2, :2] + newer.cov[:2, :2]) / dt**2
+        step = _enu_between(older.value[:3], newer.value[:3]) / dt
+        return [_Fix(newer.t_ns, step, cov + np.eye(3) * max(2.0 * dt, 0.3) ** 2)]
 
     def _velocity(self, t_ns: int, window: _Window) -> tuple[Floats, Floats] | None:
         """ENU velocity and covariance: GNSS within 0.5 s, rest, or two pose fixes within 1 s."""
@@ -150,12 +196,8 @@ class Aligner:
             return latest.value, latest.cov + np.eye(3) * (3.0 * age) ** 2
         if window.still:
             return np.zeros(3), np.eye(3) * 0.1**2
-        if len(self.poses) == 2 and 0 < (dt := (self.poses[1].t_ns - self.poses[0].t_ns) * 1e-9) <= 1.0:
-            older, newer = self.poses
-            step = _enu_between(older.value[:3], newer.value[:3]) / dt
-            cov = np.zeros((3, 3))
-            cov[:2, :2] = (older.cov[:2, :2] + newer.cov[:2, :2]) / dt**2
-            return step, cov + np.eye(3) * max(2.0 * dt, 0.3) ** 2
+        for latest in self._pose_velocity():
+            return latest.value, latest.cov
         return None
 
     def _build(
@@ -189,7 +231,7 @@ class Aligner:
 
     def _place(self, t_ns: int, sensor: Sensor, velocity: Floats) -> tuple[Floats, Floats, Floats] | None:
         """Position llh of a point of the vehicle, ENU covariance and that point's lever arm."""
-        fix = self.position
+        fix = self.positions[-1] if self.positions else None
         if sensor == Sensor.POSE_FIX:
             pose = self.poses[-1]
             llh, cov = pose.value[:3].copy(), np.diag([0.0, 0.0, _HEIGHT_SIGMA_M**2])

@@ -107,6 +107,8 @@ class Alignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """IMU window that is averaged for levelling, s."""
     min_course_speed: float = 3.0
     """GNSS course becomes yaw above this speed, m/s."""
+    max_course_sigma_deg: float = 10.0
+    """A course known worse than this is no yaw, deg."""
     course_sigma_deg: float = 2.0
     """Added to the course's own sigma: side slip and mounting, deg."""
     level_sigma_deg: float = 1.0

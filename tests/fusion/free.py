@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion.alignment import Initial
-from fusion.config import FusionConfig, GnssModel, ImuNoise, MotionModel, PoseModel
+from fusion.config import Alignment, FusionConfig, Gates, GnssModel, ImuNoise, MotionModel, PoseModel
 from fusion.events import Events, Measurements, Recorder, new_recorder
 from fusion.result import Sensor
 from fusion.run import feed, start
@@ -22,20 +22,45 @@ from sensors.vehicle import Vehicle
 Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
-FREE = FusionConfig(motion=MotionModel(zero_velocity=False, non_holonomic=False))
+FREE = FusionConfig(
+    imu=ImuNoise(noise_scale=1.0, max_gap_s=0.5), motion=MotionModel(zero_velocity=False, non_holonomic=False)
+)
 """Nothing but what the log holds."""
 HONEST = FusionConfig(
-    imu=ImuNoise(noise_scale=1.0),
+    imu=ImuNoise(noise_scale=1.0, max_gap_s=0.5, coast_accel=3.0, coast_rate_deg=20.0),
     gnss=GnssModel(
         inflation=1.0,
+        velocity_inflation=1.0,
         sigma_floor_horizontal_m=0.0,
         sigma_floor_vertical_m=0.0,
         sigma_floor_velocity=0.0,
-        velocity_inflation=1.0,
+        yaw_sigma_floor_deg=0.0,
     ),
-    pose=PoseModel(inflation=1.0, sigma_floor_m=0.0, sigma_floor_yaw_deg=0.0),
+    pose=PoseModel(
+        inflation=1.0,
+        sigma_floor_m=0.0,
+        sigma_floor_yaw_deg=0.0,
+        max_sigma_longitudinal_m=0.47,
+        max_sigma_lateral_m=0.47,
+        max_sigma_yaw_deg=0.47,
+    ),
+    motion=MotionModel(
+        rate_hz=10.0,
+        lateral_sigma=0.1,
+        vertical_sigma=0.2,
+        sigma_per_speed=0.01,
+        min_speed=2.0,
+        still_window_s=1.0,
+        still_accel=0.15,
+        still_rate_deg=0.3,
+        still_max_speed=0.3,
+        zero_velocity_sigma=0.03,
+        zero_rate_sigma_deg=0.1,
+    ),
+    gates=Gates(probability=0.9999),
+    alignment=Alignment(window_s=1.0, min_course_speed=3.0, course_sigma_deg=2.0, level_sigma_deg=1.0),
 )
-"""Noise as the simulator draws it: no inflation, no floors."""
+"""Noise as the simulator draws it: no inflation, no floors. All numbers are given: tests do not hang on defaults."""
 HONEST_FREE = msgspec.structs.replace(HONEST, motion=FREE.motion)
 
 

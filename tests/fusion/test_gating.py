@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion.config import FusionConfig, Gates, GnssModel, PoseModel
+from fusion.config import FusionConfig, Gates, GnssModel
 from fusion.gating import diagonalize, innovate, observed_directions, whiten
 from fusion.result import Decisions, Reason, Sensor
 from fusion.run import run
@@ -179,7 +179,6 @@ POSE_ONLY = msgspec.structs.replace(HONEST, gnss=GnssModel(use=False))
 
 @pytest.mark.parametrize("config", [HONEST, POSE_ONLY], ids=["with gnss", "pose fixes alone"])
 def test_fix_one_lane_off_is_rejected(log: Log, config: FusionConfig) -> None:
-    config = msgspec.structs.replace(config, alignment=config.alignment)
     good = run(log, config).states
     for row in ROWS:
         result = run(moved_fix(log, row, left=3.5), config)
@@ -191,7 +190,7 @@ def test_fix_one_lane_off_is_rejected(log: Log, config: FusionConfig) -> None:
         assert result.decisions.innovation[k, 1] == pytest.approx(3.5, abs=0.3)
         assert result.decisions.moved_m[k] == 0.0
         away = np.abs(result.states.llh[-1] - good.llh[-1]) * [6.4e6, 4.3e6, 1.0]
-        assert away.max() < 0.01
+        assert away[:2].max() < 0.01  # pose fixes say nothing of height
 
 
 def test_consistent_fixes_pass_and_jumps_of_each_axis_are_rejected(log: Log) -> None:
@@ -208,23 +207,14 @@ def test_gate_switched_off_takes_everything(log: Log) -> None:
 
 def test_blind_direction_is_dropped_and_cannot_move_the_state(log: Log) -> None:
     """The mean along the road is 5 m off where the histogram does not see it: the rest of the fix is used as before."""
-    pose = PoseModel(
-        inflation=1.0,
-        sigma_floor_m=0.0,
-        sigma_floor_yaw_deg=0.0,
-        max_sigma_longitudinal_m=0.47,
-        max_sigma_lateral_m=0.47,
-        max_sigma_yaw_deg=0.47,
-    )
-    config = msgspec.structs.replace(HONEST, pose=pose)
     row = ROWS[0]
     blind = widened(log, row, (0.6, 0.03, np.radians(0.13)))
-    results = [run(moved_fix(blind, row, along=off), config) for off in (0.0, 5.0)]
+    results = [run(moved_fix(blind, row, along=off), HONEST) for off in (0.0, 5.0)]
     for result in results:
         k = int(np.flatnonzero(result.decisions.sensor == Sensor.POSE_FIX)[row])
         assert result.decisions.reason[k] == Reason.PARTLY_ACCEPTED
         assert result.decisions.dof[k] == 2
-        assert result.decisions.threshold[k] == pytest.approx(chi2.ppf(config.gates.probability, 2))
+        assert result.decisions.threshold[k] == pytest.approx(chi2.ppf(0.9999, 2))
         assert np.isnan(result.decisions.innovation[k, 2])
     apart = np.abs(results[0].states.llh - results[1].states.llh) * [6.4e6, 4.3e6, 1.0]
     assert apart.max() < 0.05  # the estimated heading differs from the fix's by a tenth of a degree
