@@ -33,6 +33,8 @@ _DEG_PER_H = math.pi / 180.0 / 3600.0
 _MG = 9.80665e-3
 _LONGEST_BASELINE_S = 2.0
 """Positions further apart give no velocity, s."""
+_TOWN_ACCELERATION = 1.2
+"""Horizontal acceleration of a car in town, each axis, RMS, m/s^2."""
 _HEIGHT_SIGMA_M = 1000.0
 """Height where no GNSS gives it: anywhere on earth's surface."""
 
@@ -249,19 +251,21 @@ class Aligner:
     def _level(self, t_ns: int, lat: float, height: float, yaw: float, window: _Window) -> tuple[Floats, float]:
         """Roll and pitch that turn the mean specific force into acceleration minus gravity, and their sigma, rad.
 
-        The acceleration is zero at rest, else the change of GNSS velocity over the window; without it sigma is tripled.
+        The acceleration is zero at rest, else the change of GNSS velocity over the window; where neither is known, what
+        a car does in town is added to sigma.
         """
         north, up = gravity_enu(math.sin(lat), math.cos(lat), height)
         wanted = np.array([0.0, -north, -up])
-        sigma = math.radians(self.config.alignment.level_sigma_deg)
+        unknown = 0.0
         if not window.still:
             length = round((window.seconds + 0.3) * 1e9)
             used = [v for v in self.velocities if t_ns - v.t_ns <= length]
             span = (used[-1].t_ns - used[0].t_ns) * 1e-9 if len(used) > 1 else 0.0
             if span >= 0.5 * window.seconds:
                 wanted = wanted + (used[-1].value - used[0].value) / span
+                unknown = math.sqrt((used[-1].cov + used[0].cov)[:2, :2].trace() / 2.0) / span
             else:
-                sigma *= 3.0
+                unknown = _TOWN_ACCELERATION
         middle = yaw - window.gyro[2] * window.seconds / 2.0
         c, s = math.cos(middle), math.sin(middle)
         ahead, left, above = c * wanted[0] + s * wanted[1], c * wanted[1] - s * wanted[0], wanted[2]
@@ -270,7 +274,8 @@ class Aligner:
         roll = math.atan2(fy, fz) - math.asin(float(np.clip(left / math.hypot(fy, fz), -1.0, 1.0)))
         lifted = fy * math.sin(roll) + fz * math.cos(roll)
         pitch = math.atan2(ahead, above) - math.atan2(fx, lifted)
-        return np.array([roll, pitch]), sigma
+        own = math.radians(self.config.alignment.level_sigma_deg)
+        return np.array([roll, pitch]), math.hypot(own, unknown / above)
 
     def _gyro_bias(self, R: Floats, lat: float) -> tuple[Floats, float]:
         """Bias seen at rest (mean rate minus the earth's), else zero with the turn-on sigma, rad/s."""

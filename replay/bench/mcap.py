@@ -55,7 +55,7 @@ def run(repeats: int = 5, messages: int = 360_000) -> dict[str, Any]:
         "repeats": repeats,
     }
     packages = ["numba", "numpy", "zstandard", *([PEER] if PEER in median else [])]
-    return {"bench": "mcap", "rows": rows, "ratios": ratios, "conditions": conditions(packages, cores=1, **facts)}
+    return {"bench": "mcap", "rows": rows, "ratios": ratios, "conditions": conditions(packages, **facts)}
 
 
 def sensors(messages: int) -> Log:

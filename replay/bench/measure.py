@@ -1,8 +1,10 @@
 """Rows of a benchmark: repeats of a call after one that warms up, as median, least and most."""
 
+import os
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Any
 
@@ -20,6 +22,20 @@ def times(work: Callable[[], object], repeats: int) -> list[float]:
     return found
 
 
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep the process and its threads on one core, where the system lets it."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
 def row(name: str, metric: str, values: Sequence[float]) -> dict[str, Any]:
     """One line of the report."""
     array = np.asarray(values, np.float64)
@@ -34,7 +50,13 @@ def rate(name: str, metric: str, count: int, seconds: Sequence[float]) -> dict[s
 
 def conditions(packages: Sequence[str], **facts: object) -> dict[str, Any]:
     """What the figures depend on."""
-    machine = {"machine": platform.machine(), "processor": processor(), "python": platform.python_version()}
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    machine = {
+        "cores": cores,
+        "machine": platform.machine(),
+        "processor": processor(),
+        "python": platform.python_version(),
+    }
     return {**facts, **machine, **{name: version(name) for name in packages}}
 
 

@@ -43,13 +43,20 @@ class Bench:
 
     name: tyro.conf.Positional[Literal["filter", "replay", "mcap"]]
     """filter: IMU steps/s of the filter; replay: an hour of log to metrics.json; mcap: IMU messages/s read."""
+    repeats: int = 5
+    """Timed calls of each row, after one that warms up; the median counts."""
+    hours: tuple[float, ...] = (1.0,)
+    """Lengths of the log, h (replay only): figures of each and how the time grows."""
     json: bool = False
     """Print JSON."""
 
     def run(self, _: tuple[str, ...]) -> None:
         """Run one benchmark."""
-        with stage(f"benchmark {self.name}"):
-            result = import_module(f"replay.bench.{self.name}").run()
+        from replay.bench.measure import one_core
+
+        options = {"hours": self.hours} if self.name == "replay" else {}
+        with stage(f"benchmark {self.name}"), one_core():
+            result = import_module(f"replay.bench.{self.name}").run(repeats=self.repeats, **options)
         if self.json:
             print_json(result)
             return

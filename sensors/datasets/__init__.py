@@ -13,6 +13,7 @@ FORMATS = {
     "comma2k19": "segment folder with processed_log/ and global_pose/",
     "rosbag": "ROS 1 bag, or ROS 2 bag folder",
     "novatel": "NovAtel OEM7 ASCII log",
+    "gtsam-kitti": "folder gtsam/Data of the gtsam package",
 }
 """Name of each format and what SRC is."""
 

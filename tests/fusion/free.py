@@ -10,10 +10,12 @@ from fusion.config import Alignment, FusionConfig, Gates, GnssModel, ImuNoise, M
 from fusion.events import Events, Measurements, Recorder, new_recorder
 from fusion.result import Sensor
 from fusion.run import feed, start
-from fusion.state import E_ATTITUDE, E_VELOCITY, LLH, QUATERNION, VELOCITY, Core
+from fusion.state import ACCEL_BIAS, E_ATTITUDE, E_VELOCITY, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core
 from fusion.timeline import APPLY, merge, parameters, sources
+from sensors._kernels import EARTH_RATE, gravity_enu
 from sensors.geodesy import ecef_from_llh, meridian_radius, transverse_radius
 from sensors.records import Imu, Log
+from sensors.rotation import matrix_from_q
 from sensors.simulate.drive import DriveConfig, city_truth
 from sensors.simulate.imu import simulate_imu
 from sensors.simulate.trajectory import Motion, Truth
@@ -76,6 +78,21 @@ def city(duration_s: float = 300.0, seed: int = 3) -> Truth:
 def exact_imu(truth: Truth, t_ns: Nanoseconds, vehicle: Vehicle) -> Imu:
     """Samples without errors."""
     return simulate_imu(truth, t_ns, vehicle.imu, None)[0]
+
+
+def at_rest(nav: Floats, t_ns: Nanoseconds, push: Floats | None = None) -> Imu:
+    """Exact samples of a body that keeps its attitude to the local axes, with the biases of nav (16,).
+
+    push: (3,) m/s^2 on top of gravity's reaction over the first third.
+    """
+    north, up = gravity_enu(np.sin(nav[0]), np.cos(nav[0]), nav[2])
+    earth = EARTH_RATE * np.array([0.0, np.cos(nav[0]), np.sin(nav[0])])
+    to_body = matrix_from_q(nav[QUATERNION]).T
+    accel = np.repeat((to_body @ [0.0, -north, -up] + nav[ACCEL_BIAS])[None], len(t_ns), axis=0)
+    if push is not None:
+        accel[: len(t_ns) // 3] += push
+    gyro = np.repeat((to_body @ earth + nav[GYRO_BIAS])[None], len(t_ns), axis=0)
+    return Imu(t_ns, t_ns, gyro, accel)
 
 
 def nav_of(motion: Motion, row: int = 0) -> Floats:

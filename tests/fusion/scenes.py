@@ -39,3 +39,21 @@ def with_outage(log: Log, begin_s: float, length_s: float) -> Log:
         gnss_velocity=without(log.gnss_velocity, log, begin_s, end_s),
         pose_fixes=without(log.pose_fixes, log, begin_s, end_s),
     )
+
+
+def later(log: Log, begin_s: float) -> Log:
+    """The log from begin_s on, as if recording had started there."""
+    names = ("imu", "gnss", "gnss_velocity", "pose_fixes", "wheel")
+    return replace(log, **{name: without(getattr(log, name), log, -1e9, begin_s) for name in names})
+
+
+def only(log: Log, *names: str) -> Log:
+    """The log with the IMU and these records alone."""
+    others = {"gnss", "gnss_velocity", "pose_fixes", "wheel"} - set(names)
+    return replace(log, reference=None, **dict.fromkeys(others))
+
+
+def without_yaw(log: Log) -> Log:
+    """The log without a second antenna."""
+    assert log.gnss is not None
+    return replace(log, gnss=replace(log.gnss, yaw=None, yaw_sigma=None))

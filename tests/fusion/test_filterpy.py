@@ -10,15 +10,26 @@ from fusion.config import Gates, GnssModel
 from fusion.covariance import propagate, transition
 from fusion.events import OUTPUT
 from fusion.gating import correct, innovate, whiten
-from fusion.state import A_S, E_ATTITUDE, ERROR_SIZE, LLH, QUATERNION, ROW, VELOCITY, Core, covariance
+from fusion.state import A_S, E_ATTITUDE, ERROR_SIZE, LLH, ROW, VELOCITY, Core, covariance
 from fusion.timeline import noise_of
-from sensors._kernels import EARTH_RATE, gravity_enu
-from sensors.records import GnssFix, GnssVelocity, Imu, Log
-from sensors.rotation import matrix_from_q, q_from_rpy
+from sensors.records import GnssFix, GnssVelocity, Log
+from sensors.rotation import q_from_rpy
 from sensors.simulate.drive import DriveConfig, city_truth
 from sensors.simulate.gnss import displaced
 from sensors.vehicle import ImuSpec, Vehicle
-from tests.fusion.free import FREE, Floats, core_at, exact_imu, go, go_with, grid, minus, nav_of, random_covariance
+from tests.fusion.free import (
+    FREE,
+    Floats,
+    at_rest,
+    core_at,
+    exact_imu,
+    go,
+    go_with,
+    grid,
+    minus,
+    nav_of,
+    random_covariance,
+)
 from tests.fusion.test_covariance import plain
 
 KNOWN_ATTITUDE = ImuSpec(gyro_noise_deg_per_sqrt_h=0.0, gyro_bias_instability_deg_per_h=0.0)
@@ -49,16 +60,6 @@ def step(core: Core, vehicle: Vehicle) -> tuple[Floats, Floats]:
     return phi, Q
 
 
-def straight_imu(nav: Floats, push: Floats, t_ns: NDArray[np.int64]) -> Imu:
-    """Samples of a body that keeps its attitude to the local axes and is pushed at first; nav (16,) at rest."""
-    north, up = gravity_enu(np.sin(nav[0]), np.cos(nav[0]), nav[2])
-    earth = EARTH_RATE * np.array([0.0, np.cos(nav[0]), np.sin(nav[0])])
-    to_body = matrix_from_q(nav[QUATERNION]).T
-    accel = np.repeat((to_body @ [0.0, -north, -up])[None], len(t_ns), axis=0)
-    accel[: len(t_ns) // 3] += push
-    return Imu(t_ns, t_ns, np.repeat((to_body @ earth)[None], len(t_ns), axis=0), accel)
-
-
 def gnss_along(every: NDArray[np.int64], navs: Floats) -> Log:
     """GNSS positions and velocities at every time of navs (N, 16), with white errors."""
     rng, n = np.random.default_rng(3), len(every)
@@ -79,7 +80,7 @@ def test_linear_case_equals_filterpy() -> None:
     vehicle = Vehicle(imu=KNOWN_ATTITUDE)
     t = 10**18 + np.arange(10_001) * 10_000_000
     first = np.concatenate(([0.003, 0.004, 50.0], np.zeros(3), q_from_rpy(0.1, -0.2, 2.3)[0], np.zeros(6)))
-    imu, every = straight_imu(first, np.array([0.3, -0.1, 0.05]), t), t[10::10]
+    imu, every = at_rest(first, t, push=np.array([0.3, -0.1, 0.05])), t[10::10]
     free = core_at(first, imu)
     navs, steps = [], []
     for time in every:

@@ -1,0 +1,164 @@
+"""The first state: levelling, gyro bias, yaw from each source, and whether its sigmas are honest."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+
+from fusion.config import Alignment
+from fusion.result import FusionResult, Reason, Sensor
+from fusion.run import run
+from fusion.state import E_ATTITUDE, E_GYRO_BIAS, E_VELOCITY
+from sensors.records import GnssFix, GnssVelocity, Log
+from sensors.rotation import q_from_rpy, rpy_from_q
+from sensors.simulate import scenarios
+from sensors.simulate.drive import Drive, simulate_drive
+from sensors.vehicle import Vehicle
+from tests.fusion.free import HONEST_FREE, Floats, at_rest, minus, nav_of
+from tests.fusion.scenes import later, only, without_yaw
+
+PROMPT = msgspec.structs.replace(
+    HONEST_FREE,
+    output_hz=100.0,
+    alignment=Alignment(window_s=1.0, min_course_speed=3.0, course_sigma_deg=0.3, level_sigma_deg=0.4),
+)
+"""The first output comes within 10 ms of the first state. Roll and pitch of a 5 mg accelerometer: 0.3 deg."""
+MOVING_S = 30.0
+
+
+def parked(rpy: Floats, bias: Floats, yaw: bool = True, seconds: float = 5.0) -> Log:
+    """A vehicle at rest on a slope with exact GNSS, a second antenna and known biases (6,)."""
+    t = 10**18 + np.arange(round(seconds * 100) + 1) * 10_000_000
+    nav = np.concatenate(([0.84, 0.2, 560.0], np.zeros(3), q_from_rpy(*rpy)[0], bias))
+    every = t[::10]
+    n = len(every)
+    cov = np.repeat(np.eye(3)[None] * 1e-4, n, axis=0)
+    heading = np.full(n, rpy[2]) if yaw else None
+    fixes = GnssFix(
+        every, every, np.repeat(nav[None, :3], n, axis=0), cov, np.full(n, 4, np.int8), heading, np.full(n, 1e-3)
+    )
+    velocity = GnssVelocity(every, every, np.zeros((n, 3)), cov)
+    return Log(imu=at_rest(nav, t), gnss=fixes, gnss_velocity=velocity, vehicle=Vehicle())
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (0.05, -0.12, 2.0), (-0.2, 0.15, -3.1), (0.3, 0.3, 1.0)])
+def test_levelling_and_gyro_bias_at_rest_on_a_slope(rpy: tuple[float, float, float]) -> None:
+    bias = np.array([0.002, -0.001, 0.0015, 0.0, 0.0, 0.0])
+    states = run(parked(np.array(rpy), bias), PROMPT).states
+    assert rpy_from_q(states.q_enu_body[:1])[0] == pytest.approx(rpy, abs=1e-6)
+    assert states.gyro_bias[0] == pytest.approx(bias[:3], abs=1e-9)  # the earth's rate is not taken for bias
+    assert np.abs(states.vel_enu[0]).max() < 1e-6
+
+
+def test_accelerometer_bias_tilts_within_the_stated_sigma() -> None:
+    """Nothing at rest tells it from a slope: 5 mg are 0.29 deg."""
+    states = run(parked(np.zeros(3), np.array([0.0, 0.0, 0.0, 0.049, -0.049, 0.0])), PROMPT).states
+    tilt = np.degrees(rpy_from_q(states.q_enu_body[:1])[0, :2])
+    assert np.abs(tilt) == pytest.approx(0.286, abs=0.01)
+    assert (np.abs(tilt) < 2 * np.degrees(states.sigma[0, 6:8])).all()
+
+
+def test_nothing_starts_without_yaw() -> None:
+    """At rest with GNSS alone: every measurement is before alignment, and no state comes out."""
+    result = run(parked(np.array([0.0, 0.1, 1.0]), np.zeros(6), yaw=False), PROMPT)
+    assert result.aligned_ns is None
+    assert len(result.states) == 0
+    assert len(result.decisions.t_ns) == 2 * 51
+    assert (result.decisions.reason == Reason.BEFORE_ALIGNMENT).all()
+
+
+class Case(NamedTuple):
+    """Where the log starts, what it holds, which sensors may complete the first state, and what is checked of it."""
+
+    begin_s: float
+    made: Callable[[Log], Log]
+    completed_by: set[Sensor]
+    sigma_of_level_deg: float
+
+
+CASES = {
+    "pose fix at rest": Case(0.0, lambda log: only(log, "pose_fixes"), {Sensor.POSE_FIX}, 0.4),
+    "pose fix at rest with gnss": Case(
+        0.0, lambda log: without_yaw(only(log, "pose_fixes", "gnss", "gnss_velocity")), {Sensor.POSE_FIX}, 0.4
+    ),
+    "dual antenna at rest": Case(0.0, lambda log: only(log, "gnss", "gnss_velocity"), {Sensor.GNSS_YAW}, 0.4),
+    "pose fix moving": Case(
+        MOVING_S,
+        lambda log: without_yaw(only(log, "pose_fixes", "gnss", "gnss_velocity")),
+        {Sensor.POSE_FIX, Sensor.GNSS_VELOCITY},
+        0.4,
+    ),
+    "pose fix moving, no gnss": Case(MOVING_S, lambda log: only(log, "pose_fixes"), {Sensor.POSE_FIX}, 1.0),
+    "dual antenna moving": Case(
+        MOVING_S, lambda log: only(log, "gnss", "gnss_velocity"), {Sensor.GNSS_YAW, Sensor.GNSS_VELOCITY}, 0.4
+    ),
+    "course": Case(MOVING_S, lambda log: without_yaw(only(log, "gnss", "gnss_velocity")), {Sensor.GNSS_VELOCITY}, 0.4),
+    "course of positions": Case(MOVING_S, lambda log: without_yaw(only(log, "gnss")), {Sensor.GNSS_POSITION}, 1.0),
+}
+SEEDS = 30
+SETTLED_S = 40.0
+
+
+@pytest.fixture(scope="module")
+def drives() -> list[Drive]:
+    """White errors, with a second antenna."""
+    scene = scenarios.load("clean")
+    scene = msgspec.structs.replace(scene, gnss=msgspec.structs.replace(scene.gnss, dual_antenna=True))
+    return [simulate_drive(60.0, 500 + seed, scene) for seed in range(SEEDS)]
+
+
+def first_errors(result: FusionResult, drive: Drive) -> Floats:
+    """(15,) error of the first state over its sigma."""
+    states, motion = result.states, drive.truth.at(result.states.t_ns[:1])
+    assert drive.log.imu is not None
+    row = int(np.searchsorted(drive.log.imu.t_ns, states.t_ns[0]))
+    true = nav_of(motion)
+    true[10:13], true[13:] = drive.imu_biases.gyro[row], drive.imu_biases.accel[row]
+    parts = (states.llh, states.vel_enu, states.q_enu_body, states.gyro_bias, states.accel_bias)
+    estimate = np.concatenate([part[0] for part in parts])
+    return minus(true, estimate) / states.sigma[0]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_first_state_is_honest(drives: list[Drive], name: str) -> None:
+    """Errors over sigmas, RMS over seeds, vertical and horizontal apart: never above 1.5, hardly below a half."""
+    case = CASES[name]
+    config = msgspec.structs.replace(
+        PROMPT, alignment=msgspec.structs.replace(PROMPT.alignment, level_sigma_deg=case.sigma_of_level_deg)
+    )
+    errors, waited = [], []
+    for drive in drives:
+        log = case.made(later(drive.log, case.begin_s))
+        result = run(log, config)
+        if result.aligned_ns is None:
+            continue
+        used = result.decisions.reason == Reason.USED_FOR_ALIGNMENT
+        assert used.sum() == 1
+        assert Sensor(int(result.decisions.sensor[used][0])) in case.completed_by
+        assert result.decisions.t_ns[used][0] == result.aligned_ns
+        errors.append(first_errors(result, drive))
+        assert log.imu is not None
+        waited.append((result.aligned_ns - log.imu.t_ns[0]) * 1e-9)
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    groups = {
+        "horizontal": rms[:2],
+        "velocity": rms[E_VELOCITY],
+        "attitude": rms[E_ATTITUDE],
+        "gyro bias": rms[E_GYRO_BIAS],
+    }
+    print(f"{name}: {len(errors)} of {SEEDS} after {np.mean(waited):.1f} s", {k: v.round(2) for k, v in groups.items()})
+    assert len(errors) > 0.9 * SEEDS
+    assert rms.max() < 1.5
+    assert np.sqrt(np.mean(rms[:2] ** 2)) > 0.5
+
+
+def test_pose_fixes_that_see_too_little_do_not_start(drives: list[Drive]) -> None:
+    log = only(drives[0].log, "pose_fixes")
+    assert log.pose_fixes is not None
+    vague = replace(log, pose_fixes=replace(log.pose_fixes, cov=log.pose_fixes.cov * 400.0))
+    result = run(vague, PROMPT)
+    assert result.aligned_ns is None
+    assert (result.decisions.reason == Reason.BEFORE_ALIGNMENT).all()
