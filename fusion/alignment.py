@@ -77,7 +77,7 @@ class Aligner:
     par: Parameters
     positions: deque[_Fix] = field(default_factory=lambda: deque(maxlen=64))
     velocities: deque[_Fix] = field(default_factory=lambda: deque(maxlen=64))
-    poses: deque[_Fix] = field(default_factory=lambda: deque(maxlen=2))
+    poses: deque[_Fix] = field(default_factory=lambda: deque(maxlen=64))
     rest: tuple[Floats, int] | None = None
     """Sum of mean rates over windows at rest and their number."""
     rest_until_ns: int = 0
@@ -109,20 +109,11 @@ class Aligner:
         return self._build(t_ns, Sensor(sensor), yaw, yaw_var, velocity, window)
 
     def _take_position(self, fix: _Fix) -> None:
-        """Keep a position; where the receiver gives no velocity, the one over the best of the last baselines.
-
-        A short baseline shows the fixes' noise, a long one the acceleration in between (1 m/s^2): the smaller sum wins.
-        """
+        """Keep a position, and where the receiver gives no velocity the one over the last positions."""
         self.positions.append(fix)
         if self.velocities and not self._derived and fix.t_ns - self.velocities[-1].t_ns <= 1e9:
             return
-        best: _Fix | None = None
-        for older in self.positions:
-            dt = (fix.t_ns - older.t_ns) * 1e-9
-            if 0.0 < dt <= _LONGEST_BASELINE_S:
-                cov = (fix.cov + older.cov) / dt**2 + np.eye(3) * (0.5 * dt) ** 2
-                if best is None or cov[0, 0] < best.cov[0, 0]:
-                    best = _Fix(fix.t_ns, _enu_between(older.value, fix.value) / dt, cov)
+        best = _over_best_baseline(self.positions)
         if best is not None:
             self._derived = True
             self.velocities.append(best)
@@ -140,8 +131,9 @@ class Aligner:
         quiet = float(np.linalg.norm(f, axis=1).var()) < self.par.still_accel_var
         quiet = quiet and float(g[:, 2].var()) < self.par.still_rate_var
         seen = [v for v in (*self.velocities, *self._pose_velocity()) if t_ns - v.t_ns <= 1e9]
+        # steady driving is as quiet as rest: something must have seen that the vehicle is slow
         slow = all(np.linalg.norm(v.value[:2]) < 0.3 + 2.0 * math.sqrt(v.cov[0, 0] + v.cov[1, 1]) for v in seen)
-        return _Window(g.mean(axis=0), f.mean(axis=0), quiet and slow, (t[last - 1] - t[first]) * 1e-9)
+        return _Window(g.mean(axis=0), f.mean(axis=0), quiet and slow and bool(seen), (t[last - 1] - t[first]) * 1e-9)
 
     def _watch_rest(self, t_ns: int, window: _Window) -> None:
         """Average the rates of windows at rest that do not overlap."""
@@ -178,29 +170,25 @@ class Aligner:
         return math.atan2(north, east), variance + math.radians(limits.course_sigma_deg) ** 2
 
     def _pose_velocity(self) -> list[_Fix]:
-        """Velocity between the last two pose fixes, where they are within a second: none or one."""
-        if len(self.poses) < 2:
+        """Velocity over the last pose fixes (level): none or one."""
+        best = _over_best_baseline(self.poses)
+        if best is None:
             return []
-        older, newer = self.poses
-        dt = (newer.t_ns - older.t_ns) * 1e-9
-        if not 0.0 < dt <= 1.0:
-            return []
-        cov = np.zeros((3, 3))
-        cov[:2, :2] = (older.cov[:2, :2] + newer.cov[:2, :2]) / dt**2
-        step = _enu_between(older.value[:3], newer.value[:3]) / dt
-        return [_Fix(newer.t_ns, step, cov + np.eye(3) * max(2.0 * dt, 0.3) ** 2)]
+        cov = best.cov.copy()
+        cov[2], cov[:, 2] = 0.0, 0.0
+        cov[2, 2] = 0.3**2
+        return [_Fix(best.t_ns, best.value * (1.0, 1.0, 0.0), cov)]
 
     def _velocity(self, t_ns: int, window: _Window) -> tuple[Floats, Floats] | None:
-        """ENU velocity and covariance: GNSS within 0.5 s, rest, or two pose fixes within 1 s."""
+        """ENU velocity and covariance: GNSS or pose fixes within 0.5 s, else rest."""
         if self.velocities and t_ns - self.velocities[-1].t_ns <= 0.5e9:
             latest = self.velocities[-1]
             age = (t_ns - latest.t_ns) * 1e-9
             return latest.value, latest.cov + np.eye(3) * (3.0 * age) ** 2
-        if window.still:
-            return np.zeros(3), np.eye(3) * 0.1**2
         for latest in self._pose_velocity():
-            return latest.value, latest.cov
-        return None
+            if t_ns - latest.t_ns <= 0.5e9:
+                return latest.value, latest.cov
+        return (np.zeros(3), np.eye(3) * 0.1**2) if window.still else None
 
     def _build(
         self,
@@ -292,6 +280,21 @@ class Aligner:
 
 def _accel_bias_sigma(spec: ImuSpec) -> float:
     return (spec.accel_turn_on_bias_mg + spec.accel_bias_instability_mg) * _MG
+
+
+def _over_best_baseline(fixes: deque[_Fix]) -> _Fix | None:
+    """Velocity from an older fix to the last one.
+
+    A short baseline shows the fixes' noise, a long one the acceleration in between (1 m/s^2): the smaller sum wins.
+    """
+    best: _Fix | None = None
+    for older in fixes:
+        dt = (fixes[-1].t_ns - older.t_ns) * 1e-9
+        if 0.0 < dt <= _LONGEST_BASELINE_S:
+            cov = (fixes[-1].cov + older.cov) / dt**2 + np.eye(3) * (0.5 * dt) ** 2
+            if best is None or cov[0, 0] < best.cov[0, 0]:
+                best = _Fix(fixes[-1].t_ns, _enu_between(older.value, fixes[-1].value) / dt, cov)
+    return best
 
 
 def _enu_between(a: Floats, b: Floats) -> Floats:

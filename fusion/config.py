@@ -1,6 +1,21 @@
 """Every tunable number of the filter: a default, a unit, one line of meaning."""
 
+import math
+
 import msgspec
+
+from sensors.errors import EgolocError
+
+_NOT_ZERO = {
+    "output_hz",
+    "rate_hz",
+    "window_s",
+    "still_window_s",
+    "max_gap_s",
+    "max_sigma_longitudinal_m",
+    "max_sigma_lateral_m",
+    "max_sigma_yaw_deg",
+}
 
 
 class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -126,3 +141,15 @@ class FusionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     motion: MotionModel = MotionModel()
     gates: Gates = Gates()
     alignment: Alignment = Alignment()
+
+
+def check(config: msgspec.Struct, path: str = "fusion") -> None:
+    """Raise EgolocError naming the first number that the filter cannot run with."""
+    for name in config.__struct_fields__:
+        value, key = getattr(config, name), f"{path}.{name}"
+        if isinstance(value, msgspec.Struct):
+            check(value, key)
+        elif name == "probability" and not 0.5 <= value < 1.0:
+            raise EgolocError(f"config: {key}: expected 0.5..1, got {value}")
+        elif not 0.0 <= value < math.inf or (value == 0.0 and name in _NOT_ZERO):
+            raise EgolocError(f"config: {key}: expected a number above zero, got {value}")

@@ -73,7 +73,7 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     nav, P, R, residual = core.nav, core.P, core.R, core.residual
     speed = np.sqrt(nav[3] ** 2 + nav[4] ** 2 + nav[5] ** 2)
     quiet = False
-    if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4] + P[5, 5]):
+    if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4]):
         limits = (par.still_window_ns, par.still_accel_var, par.still_rate_var)
         quiet, w0, w1, w2 = still(core.ring, core.ring_t, core.clock, nav, residual, limits, now)
         if quiet:

@@ -45,8 +45,8 @@ def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
     imu = log.imu
     if imu is None or len(imu) < 2:
         raise EgolocError("the log has no IMU samples: expected sensor_msgs/msg/Imu on a topic")
-    found = sources(log, config)
     par = parameters(log.vehicle, config)
+    found = sources(log, config)
     order = np.lexsort((found.kind, found.t_ns))
     initial = _align(log, config, found, order, imu)
     if initial is None:

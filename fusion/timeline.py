@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion.config import FusionConfig
+from fusion.config import FusionConfig, check
 from fusion.covariance import Noise
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters
 from fusion.result import Reason, Sensor
@@ -45,8 +45,7 @@ def noise_of(spec: ImuSpec, scale: float) -> Noise:
 def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
     """The configuration in SI units."""
     gates, motion, pose = config.gates, config.motion, config.pose
-    if not 0.5 <= gates.probability < 1.0:
-        raise EgolocError(f"config: fusion.gates.probability: expected 0.5..1, got {gates.probability}")
+    check(config)
     if gates.use:
         first, second, third = (float(chi2.ppf(gates.probability, dof)) for dof in (1, 2, 3))
     else:
@@ -159,7 +158,7 @@ def sources(log: Log, config: FusionConfig) -> Sources:
         verdict = _gnss_verdict(log.gnss, config)
         t = log.gnss.t_ns - round(vehicle.gnss_delay_s * 1e9)
         add(Sensor.GNSS_POSITION, t, log.gnss.arrival_ns, np.arange(len(t)), verdict)
-        rows = np.flatnonzero(np.isfinite(yaw))
+        rows = np.flatnonzero(np.isfinite(yaw_var))
         add(Sensor.GNSS_YAW, t[rows], log.gnss.arrival_ns[rows], rows, verdict[rows])
     vel, vel_cov = empty, np.empty((0, 3, 3))
     if log.gnss_velocity is not None:
@@ -204,13 +203,13 @@ def _gnss_verdict(fixes: GnssFix, config: FusionConfig) -> NDArray[np.int8]:
 
 
 def _gnss_columns(fixes: GnssFix, vehicle: Vehicle, config: FusionConfig) -> tuple[Floats, Floats, Floats, Floats]:
-    """llh, effective ENU covariance, yaw and its effective variance: inflation, floors, lever arm."""
+    """llh, effective ENU covariance, yaw and its effective variance (NaN without a yaw of known accuracy)."""
     model = config.gnss
     floors = np.array([model.sigma_floor_horizontal_m] * 2 + [model.sigma_floor_vertical_m]) ** 2
     cov = _floor(fixes.cov_enu * model.inflation, floors)
     cov = cov + np.eye(3) * vehicle.gnss_lever_arm_sigma_m**2
     yaw_var = np.maximum(fixes.yaw_sigma, np.radians(model.yaw_sigma_floor_deg)) ** 2
-    return fixes.llh, cov, fixes.yaw, yaw_var
+    return fixes.llh, cov, fixes.yaw, np.where(np.isfinite(fixes.yaw), yaw_var, np.nan)
 
 
 def _velocity_cov(velocity: GnssVelocity, config: FusionConfig) -> Floats:
