@@ -237,7 +237,11 @@ def pose_columns(fixes: PoseFix, frame: MapFrame, config: FusionConfig) -> tuple
     llh = llh_from_map(frame, p_map)
     rotation, scale = rotation_map_enu(frame, llh)
     jacobian = rotation[:, :2, :] * scale[:, None, None]
-    to_enu = np.linalg.inv(jacobian[:, :, :2])
+    to_enu = np.empty((n, 2, 2))
+    determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+    to_enu[:, 0, 0], to_enu[:, 0, 1] = jacobian[:, 1, 1], -jacobian[:, 0, 1]
+    to_enu[:, 1, 0], to_enu[:, 1, 1] = -jacobian[:, 1, 0], jacobian[:, 0, 0]
+    to_enu /= determinant[:, None, None]
     tilt = np.einsum("nij,nj->ni", to_enu, jacobian[:, :, 2])
     c, s = np.cos(fixes.pose[:, 2]), np.sin(fixes.pose[:, 2])
     east = to_enu[:, 0, 0] * c + to_enu[:, 0, 1] * s
