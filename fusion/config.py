@@ -1,9 +1,11 @@
 """Every tunable number of the filter: a default, a unit, one line of meaning."""
 
 import math
+from typing import Annotated
 
 import msgspec
 
+from sensors.bounds import NonNegative, Positive, RateHz
 from sensors.errors import EgolocError
 
 _NOT_ZERO = {
@@ -21,13 +23,13 @@ _NOT_ZERO = {
 class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How the datasheet figures become process noise."""
 
-    noise_scale: float = 2.0
+    noise_scale: NonNegative = 2.0
     """White noise of gyro and accelerometer, times the datasheet's (vibration, quantization), -."""
-    max_gap_s: float = 0.5
+    max_gap_s: Positive = 0.5
     """A longer pause in the IMU is coasted over at constant velocity, s."""
-    coast_accel: float = 3.0
+    coast_accel: Positive = 3.0
     """Random walk of velocity while coasting, m/s/sqrt(s)."""
-    coast_rate_deg: float = 20.0
+    coast_rate_deg: Positive = 20.0
     """Random walk of yaw while coasting (a tenth of it tilts), deg/sqrt(s)."""
 
 
@@ -36,21 +38,21 @@ class GnssModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     use: bool = True
     """Apply GNSS at all."""
-    min_status: int = 1
+    min_status: Annotated[int, msgspec.Meta(ge=1, le=4)] = 1
     """Lowest status that is applied: 1 single, 2 DGNSS, 3 float, 4 fixed."""
-    sigma_floor_horizontal_m: float = 0.02
+    sigma_floor_horizontal_m: NonNegative = 0.02
     """Receivers claim 3 mm; below this a correct fix would be gated for ever, m."""
-    sigma_floor_vertical_m: float = 0.05
+    sigma_floor_vertical_m: NonNegative = 0.05
     """The same, vertical, m."""
-    sigma_floor_velocity: float = 0.03
+    sigma_floor_velocity: NonNegative = 0.03
     """The same for velocity, m/s."""
-    inflation: float = 4.0
+    inflation: Positive = 4.0
     """Position variance is multiplied by this: RTK errors are correlated in time, -."""
-    velocity_inflation: float = 1.0
+    velocity_inflation: Positive = 1.0
     """Velocity variance is multiplied by this, -."""
     use_velocity: bool = True
     """Apply GNSS velocities."""
-    yaw_sigma_floor_deg: float = 0.2
+    yaw_sigma_floor_deg: Positive = 0.2
     """Smallest sigma of a dual-antenna yaw, deg."""
 
 
@@ -59,17 +61,17 @@ class PoseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     use: bool = True
     """Apply pose fixes at all."""
-    inflation: float = 4.0
+    inflation: Positive = 4.0
     """The fix's covariance is multiplied by this: errors of map and features last over many frames, -."""
-    sigma_floor_m: float = 0.02
+    sigma_floor_m: NonNegative = 0.02
     """Smallest sigma along any direction of the plane, m."""
-    sigma_floor_yaw_deg: float = 0.05
+    sigma_floor_yaw_deg: NonNegative = 0.05
     """Smallest sigma of yaw, deg."""
-    max_sigma_longitudinal_m: float = 0.47
+    max_sigma_longitudinal_m: Positive = 0.47
     """Covariance gate: a direction with more than this is not observed by the histogram and is dropped, m."""
-    max_sigma_lateral_m: float = 0.47
+    max_sigma_lateral_m: Positive = 0.47
     """The same, lateral, m."""
-    max_sigma_yaw_deg: float = 0.47
+    max_sigma_yaw_deg: Positive = 0.47
     """The same, yaw, deg."""
 
 
@@ -80,27 +82,29 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Apply zero lateral and vertical velocity of the rear axle."""
     zero_velocity: bool = True
     """Apply zero velocity and zero rate while the IMU shows that the vehicle stands."""
-    rate_hz: float = 10.0
+    rate_hz: RateHz = 10.0
     """How often these are applied, Hz."""
-    lateral_sigma: float = 0.1
+    lateral_sigma: Positive = 0.1
     """Lateral velocity of the rear axle, m/s."""
-    vertical_sigma: float = 0.2
+    vertical_sigma: Positive = 0.2
     """Vertical velocity of the rear axle, m/s."""
-    sigma_per_speed: float = 0.01
+    sigma_per_speed: NonNegative = 0.01
     """Growth of both with speed (mounting angles known to half a degree), m/s per m/s."""
-    min_speed: float = 2.0
+    min_speed: NonNegative = 2.0
     """Below this speed the non-holonomic update waits, m/s."""
-    still_window_s: float = 1.0
+    still_window_s: Positive = 1.0
     """Window over which the IMU must be quiet, s."""
-    still_accel: float = 0.25
+    still_accel: NonNegative = 0.25
     """Largest standard deviation of the acceleration's norm at rest, m/s^2."""
-    still_rate_deg: float = 0.3
+    still_rate_deg: NonNegative = 0.3
     """Largest standard deviation of the yaw rate at rest (idling shakes the other two), deg/s."""
-    still_max_speed: float = 0.3
+    still_ratio: Positive = 4.0
+    """And at most so many times the deviations of the quietest window so far: a queue creeps smoothly, -."""
+    still_max_speed: NonNegative = 0.3
     """Above this estimated speed (plus three sigmas) the vehicle is not taken to stand, m/s."""
-    zero_velocity_sigma: float = 0.05
+    zero_velocity_sigma: Positive = 0.05
     """Velocity at rest, m/s."""
-    zero_rate_sigma_deg: float = 0.1
+    zero_rate_sigma_deg: Positive = 0.1
     """Turn rate at rest, besides the gyro's noise, deg/s."""
     wheel: bool = True
     """Apply wheel speeds."""
@@ -109,7 +113,7 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Chi-square gate on innovations."""
 
-    probability: float = 0.9999
+    probability: Annotated[float, msgspec.Meta(ge=0.5, lt=1.0)] = 0.9999
     """Probability that a correct measurement passes, -."""
     use: bool = True
     """Gate at all."""
@@ -118,22 +122,22 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Alignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How the first state is found."""
 
-    window_s: float = 1.0
+    window_s: Positive = 1.0
     """IMU window that is averaged for levelling, s."""
-    min_course_speed: float = 3.0
+    min_course_speed: NonNegative = 3.0
     """GNSS course becomes yaw above this speed, m/s."""
-    max_course_sigma_deg: float = 10.0
+    max_course_sigma_deg: Positive = 10.0
     """A course known worse than this is no yaw, deg."""
-    course_sigma_deg: float = 2.0
+    course_sigma_deg: NonNegative = 2.0
     """Added to the course's own sigma: side slip and mounting, deg."""
-    level_sigma_deg: float = 1.0
+    level_sigma_deg: Positive = 1.0
     """Roll and pitch after levelling, deg."""
 
 
 class FusionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole filter."""
 
-    output_hz: float = 10.0
+    output_hz: RateHz = 10.0
     """Rate of the recorded states, Hz."""
     imu: ImuNoise = ImuNoise()
     gnss: GnssModel = GnssModel()

@@ -14,8 +14,10 @@ from sensors.kernel import kernel
 _ZERO_VELOCITY = int(Sensor.ZERO_VELOCITY)
 _NON_HOLONOMIC = int(Sensor.NON_HOLONOMIC)
 
-StillLimits = tuple[int, float, float]
-"""Window ns, variance of the specific force's norm (m/s^2)^2 and of the yaw rate (rad/s)^2."""
+QUIETEST_FORCE = 0.003
+"""No IMU rests quieter than this (a stuck one does), m/s^2."""
+QUIETEST_TURN = 1e-4
+"""The same for the yaw rate, rad/s."""
 
 
 @kernel()
@@ -27,12 +29,12 @@ def clear(a: Floats) -> None:
 
 
 @kernel()
-def still(
-    ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, recent: Floats, limits: StillLimits, now: int
-) -> tuple[bool, float, float, float]:
-    """Whether the IMU was quiet over the window before now, and its mean rate since the last motion tick, rad/s.
+def shaking(
+    ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, recent: Floats, window_ns: int, now: int
+) -> tuple[bool, float, float]:
+    """Whether samples fill the window before now; variances of |specific force| (m/s^2)^2 and yaw rate (rad/s)^2.
 
-    recent (3,): scratch for the sum of the rates since the tick.
+    recent (3,): becomes the mean rate since the last motion tick, rad/s.
     """
     count = clock[C_COUNT]
     recent[0] = recent[1] = recent[2] = 0.0
@@ -42,7 +44,7 @@ def still(
     for back in range(min(count, RING_SIZE)):
         i = (count - 1 - back) % RING_SIZE
         t = ring_t[i]
-        if t <= now - limits[0]:
+        if t <= now - window_ns:
             break
         oldest = t
         n += 1
@@ -56,11 +58,25 @@ def still(
         f2 = ring[i, 3] ** 2 + ring[i, 4] ** 2 + ring[i, 5] ** 2
         norm += np.sqrt(f2)
         norm2 += f2
-    if n < 5 or fresh == 0 or now - oldest < 0.8 * limits[0]:
-        return False, 0.0, 0.0, 0.0
-    quiet = norm2 / n - (norm / n) ** 2 < limits[1]
-    quiet = quiet and turn2 / n - (turn / n) ** 2 < limits[2]
-    return quiet, recent[0] / fresh, recent[1] / fresh, recent[2] / fresh
+    if n < 5 or fresh == 0 or now - oldest < 0.8 * window_ns:
+        return False, 0.0, 0.0
+    for k in range(3):
+        recent[k] /= fresh
+    return True, norm2 / n - (norm / n) ** 2, turn2 / n - (turn / n) ** 2
+
+
+@kernel()
+def still(quietest: Floats, par: Parameters, force_var: float, turn_var: float) -> bool:
+    """Whether a window is as quiet as rest: below the limits and not much above the quietest so far (2,).
+
+    A car in a queue creeps as smoothly as another one idles; only its own rest tells.
+    """
+    quietest[0] = max(min(quietest[0], force_var), QUIETEST_FORCE**2)
+    quietest[1] = max(min(quietest[1], turn_var), QUIETEST_TURN**2)
+    ratio = par.still_ratio * par.still_ratio
+    if turn_var >= min(par.still_rate_var, ratio * quietest[1]):
+        return False
+    return bool(force_var < min(par.still_accel_var, ratio * quietest[0]))
 
 
 @kernel(inline="always")
@@ -74,10 +90,10 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     speed = np.sqrt(nav[3] ** 2 + nav[4] ** 2 + nav[5] ** 2)
     quiet = False
     if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4]):
-        limits = (par.still_window_ns, par.still_accel_var, par.still_rate_var)
-        quiet, w0, w1, w2 = still(core.ring, core.ring_t, core.clock, nav, residual, limits, now)
+        full, force, turn = shaking(core.ring, core.ring_t, core.clock, nav, residual, par.still_window_ns, now)
+        quiet = full and still(core.quietest, par, force, turn)
         if quiet:
-            _zero_rate(core, par, (w0, w1, w2))
+            _zero_rate(core, par, (residual[0], residual[1], residual[2]))
     core.clock[C_TICK] = now
     clear(R)
     clear(core.H)

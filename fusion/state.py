@@ -65,6 +65,7 @@ class Core(NamedTuple):
     span (1,): seconds since P was propagated; acc (14, 3): the transition over them (A_*).
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
+    quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
     phi, M (9, 16), Mt (15, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
     """
@@ -78,6 +79,7 @@ class Core(NamedTuple):
     earth: Floats
     ring: Floats
     ring_t: Nanoseconds
+    quietest: Floats
     phi: Floats
     M: Floats
     Mt: Floats
@@ -102,6 +104,7 @@ def new_core() -> Core:
         earth=np.zeros(8),
         ring=np.zeros((RING_SIZE, 6)),
         ring_t=np.zeros(RING_SIZE, np.int64),
+        quietest=np.full(2, np.inf),
         phi=np.zeros((9, ROW)),
         M=np.zeros((9, ROW)),
         Mt=np.zeros((ERROR_SIZE, ROW)),

@@ -1,19 +1,20 @@
 """The whole configuration of a replay: read from TOML, written complete into the run folder."""
 
 import tomllib
+from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
 from fusion.config import FusionConfig
+from sensors.bounds import Positive
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
 from sensors.vehicle import Vehicle
 
 S = TypeVar("S", bound=msgspec.Struct)
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -27,6 +28,8 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Yaw, deg."""
 
 
+SHORTEST_STRETCH_S = 0.1
+"""Of hidden GNSS."""
 LIMITS = {
     "paper": Limits(),
     "highway": Limits(1.40, 0.57, 1.5),
@@ -93,9 +96,11 @@ def parse_hide_gnss(text: str) -> HideGnss:
 
 
 def check_hide_gnss(hide: HideGnss, where: str) -> HideGnss:
-    """Stretches must be positive and leave GNSS between them."""
+    """Stretches must be long enough to hold a fix and leave GNSS between them."""
     if not 0 < hide.length_s < hide.every_s < float("inf"):
         raise EgolocError(f"{where}: expected 0 < LENGTH < EVERY, got {hide.every_s:g}:{hide.length_s:g}")
+    if hide.length_s < SHORTEST_STRETCH_S:
+        raise EgolocError(f"{where}: expected a LENGTH of at least {SHORTEST_STRETCH_S:g} s, got {hide.length_s:g}")
     return hide
 
 
@@ -133,7 +138,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
             return tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:  # no TOML, no text, or no path
         raise EgolocError(f"{path}: expected TOML: {error}") from None
 
 
@@ -141,13 +146,25 @@ def _convert(raw: dict[str, Any], kind: type[S], path: Path) -> S:
     try:
         result = msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
-        raise EgolocError(f"{path}: {_explain(str(error), kind)}") from None
-    if isinstance(result, RunConfig) and result.hide_gnss is not None:
-        check_hide_gnss(result.hide_gnss, f"{path}: hide_gnss")
+        raise EgolocError(f"{path}: {_explain(str(error), kind, raw)}") from None
+    if isinstance(result, RunConfig):
+        _check_run(result, path)
     return result
 
 
-def _explain(message: str, kind: type[msgspec.Struct]) -> str:
+def _check_run(config: RunConfig, path: Path) -> None:
+    """What no single key's type can say."""
+    from sensors.mcap.topics import check_choice
+
+    if config.hide_gnss is not None:
+        check_hide_gnss(config.hide_gnss, f"{path}: hide_gnss")
+    try:
+        check_choice(config.topics)
+    except EgolocError as error:
+        raise EgolocError(f"{path}: {error}") from None
+
+
+def _explain(message: str, kind: type[msgspec.Struct], raw: Mapping[str, Any]) -> str:
     """msgspec's ``Object contains unknown field `x` - at `$.a.b` `` as ``a.b: unknown key "x"; expected ...``."""
     what, _, where = message.partition(" - at ")
     place = where.strip("`").removeprefix("$").removeprefix(".")
@@ -155,11 +172,21 @@ def _explain(message: str, kind: type[msgspec.Struct]) -> str:
     if what.startswith("Invalid enum value"):
         return f"{prefix}expected one of {', '.join(_choices(kind, place.split('.')))}, got {what.split(' ', 3)[3]}"
     if "unknown field" not in what:
-        return prefix + what[0].lower() + what[1:]
+        return prefix + what[0].lower() + what[1:] + ("" if "got" in what else _given(raw, place))
     key = what.split("`")[1]
     known = _keys(kind, place.split(".") if place else [])
     near = get_close_matches(key, known, 1)
     return f'{prefix}unknown key "{key}"; ' + (f'did you mean "{near[0]}"?' if near else f"expected {', '.join(known)}")
+
+
+def _given(raw: Any, place: str) -> str:
+    """``, got VALUE`` of the number at a place; nothing where there is none."""
+    for step in place.replace("[", ".").replace("]", "").split("."):
+        try:
+            raw = raw[int(step)] if isinstance(raw, list) else raw[step]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return ""
+    return f", got {raw}" if isinstance(raw, int | float) and not isinstance(raw, bool) else ""
 
 
 def _keys(kind: type[msgspec.Struct], place: list[str]) -> list[str]:

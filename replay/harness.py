@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from fusion.result import FusionResult
 from replay.config import RunConfig, to_toml
 from replay.decisions import decision_columns
 from replay.hiding import Hidden, hide_gnss
+from replay.plausibility import warnings_of
 from replay.references import Reference, has_heading
+from replay.requirements import NO_POSITIONS, check_replayable
+from replay.run_files import Facts, ReferenceFacts
 from replay.scoring import score
 from replay.states import state_columns
 from replay.store import Run, check_free, file_hash, new_folder, versions, write_json, write_tables
@@ -57,8 +61,12 @@ def replay_file(
         log = read_log(path, config.topics)
         if reference_file is not None:
             log = with_reference(log, reference_file, config.map_frame or log.map_frame)
+        check_replayable(log, str(path))
         log = place(log, config, str(path))
-        done = replay_log(log, config, source=reference_file.name if reference_file else "log")
+        try:
+            done = replay_log(log, config, source=reference_file.name if reference_file else "log")
+        except EgolocError as error:
+            raise EgolocError(f"{path}: {error}") from None
         manifest = {
             "log": {"path": str(path), "bytes": path.stat().st_size, "sha256": digest.result()},
             "reference_file": reference_file and {"path": str(reference_file), "sha256": file_hash(reference_file)},
@@ -103,10 +111,11 @@ def _own_frame(log: Log, where: str) -> MapFrame:
             "expected a map frame in the log or [map_frame] in the config"
         )
     if log.gnss is None or not len(log.gnss):
-        raise EgolocError(
-            f"{where}: expected GNSS fixes or pose fixes, found neither: nothing tells where the vehicle is"
-        )
-    return utm_frame(log.gnss.llh[0])
+        raise EgolocError(f"{where}: {NO_POSITIONS}")
+    try:
+        return utm_frame(log.gnss.llh[0])
+    except EgolocError as error:
+        raise EgolocError(f"{where}: {error}: expected [map_frame] in the config") from None
 
 
 def replay_log(log: Log, config: RunConfig, *, source: str = "log") -> Replay:
@@ -116,8 +125,9 @@ def replay_log(log: Log, config: RunConfig, *, source: str = "log") -> Replay:
     assert log.map_frame is not None
     hidden = hide_gnss(log, config.hide_gnss) if config.hide_gnss is not None else None
     given = hidden.log if hidden else log
-    result = fuse(given, config.fusion)
-    return assemble(given, config, result, hidden, source)
+    with np.errstate(all="ignore"):  # what is not finite is said in warnings, not by numpy
+        result = fuse(given, config.fusion)
+        return assemble(given, config, result, hidden, source)
 
 
 def assemble(
@@ -144,11 +154,10 @@ def _reference(log: Log, hidden: Hidden | None) -> Reference | None:
     return Reference(log.reference, log.vehicle.reference_lever_arm)
 
 
-def _facts(
-    log: Log, config: RunConfig, result: FusionResult, reference: Reference | None, source: str
-) -> dict[str, Any]:
+def _facts(log: Log, config: RunConfig, result: FusionResult, reference: Reference | None, source: str) -> Facts:
     """What scoring must know besides the tables."""
-    start_ns = int(log.imu.t_ns[0]) if log.imu is not None and len(log.imu) else 0
+    assert log.imu is not None
+    start_ns = int(log.imu.t_ns[0])
     aligned = None if result.aligned_ns is None else (result.aligned_ns - start_ns) / NS_PER_S
     stretches = None if reference is None or reference.stretches is None else reference.stretches.tolist()
     return {
@@ -159,11 +168,12 @@ def _facts(
         "reference": _describe(reference, source),
         "hide_gnss": None if config.hide_gnss is None else msgspec.to_builtins(config.hide_gnss),
         "stretches": stretches,
+        "warnings": warnings_of(result, log),
         "left_out": _left_out((*log.left_out, *result.left_out)),
     }
 
 
-def _describe(reference: Reference | None, source: str) -> dict[str, str | None]:
+def _describe(reference: Reference | None, source: str) -> ReferenceFacts:
     if reference is None:
         return {"kind": None, "source": None, "heading": None}
     kind = "odometry" if reference.stretches is None else "hidden gnss"

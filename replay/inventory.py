@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
+from replay.plausibility import imu_findings
 from replay.references import gap_ns, has_heading
+from replay.requirements import what_is_missing
 from replay.table import output_console
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
@@ -100,14 +102,13 @@ def timing(t_ns: NDArray[np.int64]) -> dict[str, Any]:
 
 
 def remarks(log: Log) -> Iterator[str]:
-    """What a replay would do with this log, or why it cannot."""
-    if log.imu is None or len(log.imu) < 2:
-        yield "No IMU samples: it cannot be replayed."
+    """What a replay would do with this log, or why it cannot, and what is odd about its IMU."""
+    missing = what_is_missing(log)
+    if missing is not None or log.imu is None:
+        yield f"It cannot be replayed: {missing}."
         return
-    position = [name for name, record in (("GNSS", log.gnss), ("pose fixes", log.pose_fixes)) if record is not None]
-    if not position:
-        yield "Neither GNSS nor pose fixes: it cannot be replayed."
-        return
+    for _, finding in imu_findings(log.imu, land_vehicle=log.vehicle.land_vehicle):
+        yield f"WARNING: {finding}"
     mapped = log.pose_fixes is not None or log.reference is not None
     if mapped and log.map_frame is None:
         yield "Map coordinates without a map frame: a replay needs [map_frame] in its config."

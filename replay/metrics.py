@@ -23,6 +23,8 @@ COVER_PERIODS = 1.5
 """A sample covers at most this many nominal periods."""
 SIGMA_SHARE = 1 / 3
 """The reference's sigma must not exceed this share of the limit."""
+LARGEST_ERROR = 1e100
+"""What a diverged filter is off at most: its square is still a number."""
 MIN_EVALUATED_NS = 10 * NS_PER_S
 """With less evaluated time than this nothing is said."""
 MIN_DISTANCE_M = 1.0
@@ -95,7 +97,7 @@ def well_known(sigma: Floats, limits: Limits, *, yaw: bool) -> tuple[Mask, Mask]
 
 def axis_metrics(error: Floats, thresholds: tuple[float, ...]) -> dict[str, Any] | None:
     """MAE, RMSE, percentiles and shares below thresholds of the finite errors (N,); None if there is none."""
-    size = np.sort(np.abs(error[np.isfinite(error)]))
+    size = np.sort(np.minimum(np.abs(error[np.isfinite(error)]), LARGEST_ERROR))
     if not len(size):
         return None
     p50, p95, p99 = np.percentile(size, (50, 95, 99))

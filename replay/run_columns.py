@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from replay.store import read_json
+from replay.run_files import EXPECTED, SeenManifest, SeenMetrics, checked, read_json, read_table
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 
@@ -62,9 +61,9 @@ class RunColumns:
 def load_columns(run: Path) -> RunColumns:
     """The tables and facts of a run folder; EgolocError names the file and column that is missing."""
     if not run.is_dir():
-        raise EgolocError(f"{run}: expected a run folder, as egoloc replay writes it")
-    states = _read_table(run / "states.parquet", STATES)
-    decisions = _read_table(run / "decisions.parquet", DECISIONS)
+        raise EgolocError(f"{run}: {EXPECTED}")
+    states = read_table(run / "states.parquet", STATES)
+    decisions = read_table(run / "decisions.parquet", DECISIONS)
     sensor, sensor_names = _codes(decisions["sensor"])
     reason, reasons = _codes(decisions["reason"])
     columns = {name: _array(decisions[name]) for name in DECISIONS if name not in {"sensor", "reason"}}
@@ -80,8 +79,8 @@ def load_columns(run: Path) -> RunColumns:
         states={name: _array(states[name]) for name in STATES},
         sensors=by_sensor,
         reasons=reasons,
-        metrics=read_json(run / "metrics.json"),
-        manifest=read_json(run / "manifest.json"),
+        metrics=_read_checked(run / "metrics.json", SeenMetrics),
+        manifest=_read_checked(run / "manifest.json", SeenManifest),
         config=_read_toml(run / "config.toml"),
     )
 
@@ -129,23 +128,18 @@ def strips(t_ns: Nanoseconds, points: Floats) -> list[Floats]:
     return [part for part in np.split(kept, gaps(t)) if len(part) > 1]
 
 
-def _read_table(path: Path, columns: Sequence[str]) -> pa.Table:
-    if not path.is_file():
-        raise EgolocError(f"{path}: missing: expected a run folder, as egoloc replay writes it")
-    try:
-        missing = [name for name in columns if name not in pq.read_schema(path).names]
-        if missing:
-            raise EgolocError(f"{path}: expected the columns of a run, without: {', '.join(missing)}")
-        return pq.read_table(path, columns=list(columns))
-    except (pa.ArrowException, OSError) as error:
-        raise EgolocError(f"{path}: expected a Parquet file: {str(error).splitlines()[0]}") from None
+def _read_checked(path: Path, kind: type[SeenMetrics] | type[SeenManifest]) -> dict[str, Any]:
+    """A JSON object, whole, whose part of a kind is as it should be."""
+    content = read_json(path)
+    checked(content, kind, path)
+    return content
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text())
     except FileNotFoundError:
-        raise EgolocError(f"{path}: missing: expected a run folder, as egoloc replay writes it") from None
+        raise EgolocError(f"{path}: missing: {EXPECTED}") from None
     except ValueError as error:
         raise EgolocError(f"{path}: expected TOML: {error}") from None
 

@@ -52,6 +52,7 @@ def score(run: Run, limits: Limits) -> Metrics:
     metrics["alignment_s"] = facts["alignment_s"]
     metrics["decisions"] = _decision_counts(run.decisions)
     metrics["left_out"] = facts["left_out"]
+    metrics["warnings"] = facts["warnings"]
     return metrics
 
 
@@ -74,7 +75,7 @@ def _methods(run: Run, evaluated: NDArray[np.bool_], span: Span, limits: Limits)
     present = [name for name in present if not (hidden and name == "gnss")]
     least: float = MIN_EVALUATED_NS
     if hidden:
-        least = min(least, *(0.9 * (end - start) for start, end in run.facts["stretches"]))
+        least = min(least, *(0.9 * (end - start) for start, end in run.facts["stretches"] or ()))
     if span.total_ns < max(least, 1):
         return {name: dict(NOT_EVALUATED) for name in (*present, "fusion")}
     methods = {name: sensor_metrics(run.decisions, METHODS[name], span, limits) for name in present}
@@ -99,14 +100,17 @@ def sensor_metrics(decisions: Columns, sensor: Sensor, span: Span, limits: Limit
 
 def _hidden(run: Run) -> Metrics:
     """How far the filter had drifted at the end of every stretch without GNSS."""
-    stretches = [_stretch(run, index, start, end) for index, (start, end) in enumerate(run.facts["stretches"])]
+    hide, planned = run.facts["hide_gnss"], run.facts["stretches"]
+    assert hide is not None
+    assert planned is not None
+    stretches = [_stretch(run, index, start, end) for index, (start, end) in enumerate(planned)]
     ends = [s for s in stretches if s["end_horizontal_m"] is not None]
     error = np.array([s["end_horizontal_m"] for s in ends])
     ratio = np.array([s["end_horizontal_m"] / s["end_sigma_m"] for s in ends])
     p50, p95 = np.percentile(error, (50, 95)).tolist() if ends else (None, None)
     return {
         "stretches": len(ends),
-        "length_s": run.facts["hide_gnss"]["length_s"],
+        "length_s": hide["length_s"],
         "end_horizontal_m": {"p50": p50, "p95": p95, "max": float(error.max()) if ends else None},
         "end_error_over_sigma_rms": float(np.sqrt(np.mean(ratio**2))) if ends else None,
         "without_end": len(stretches) - len(ends),
@@ -115,9 +119,10 @@ def _hidden(run: Run) -> Metrics:
 
 
 def _stretch(run: Run, index: int, start: int, end: int) -> Metrics:
-    """One stretch: start since the log's, horizontal error and sigma at its last epoch that has a reference."""
+    """One stretch: start since the log's, horizontal error and sigma at its last epoch that has both."""
     states = run.states
-    rows = np.flatnonzero((states["stretch"] == index) & np.isfinite(states["ref_x"]) & np.isfinite(states["x"]))
+    known = [np.isfinite(states[name]) for name in ("ref_x", "x", "y", "sigma_lon", "sigma_lat")]
+    rows = np.flatnonzero((states["stretch"] == index) & np.all(known, axis=0))
     found = len(rows) > 0 and end - states["t_ns"][rows[-1]] <= END_TOLERANCE_NS
     entry: Metrics = {
         "start_s": (start - run.facts["start_ns"]) / NS_PER_S,

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,19 +15,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.result import Reason, Sensor
-from replay.references import Excluded
+from replay.run_files import CODES, EXPECTED, Facts, Manifest, checked, read_json, read_table
 from sensors.errors import EgolocError
 
 if TYPE_CHECKING:
     import pyarrow
 
 Columns = dict[str, NDArray[Any]]
-Facts = dict[str, Any]
 
-CODES = {"sensor": Sensor, "reason": Reason, "excluded": Excluded}
-"""Columns that are numbers here and dictionary strings (lower-case names) in Parquet."""
 FILES = {"config.toml", "manifest.json", "metrics.json", "states.parquet", "decisions.parquet", "report.html"}
+STATES = (
+    *("t_ns", "x", "y", "ref_x", "ref_y", "ref_speed", "ref_sigma_m", "ref_sigma_yaw", "excluded"),
+    *("err_lon", "err_lat", "err_yaw", "sigma_lon", "sigma_lat", "stretch"),
+)
+DECISIONS = ("t_ns", "sensor", "row", "reason", "accepted", "status", "err_lon", "err_lat", "err_yaw")
+"""The columns of both tables that scoring reads."""
 VERSIONED = ("egoloc", "numpy", "numba", "scipy", "pyarrow", "pymap3d", "pyproj", "mcap")
 
 
@@ -47,11 +49,10 @@ def new_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     Only a run folder is ever overwritten.
     """
     check_free(out, overwrite=overwrite)
-    out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
     try:
+        temporary.mkdir(parents=True)
         yield temporary
         if out.exists():
             old = out.with_name(f".{out.name}.{os.getpid()}.old")
@@ -60,19 +61,36 @@ def new_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
             shutil.rmtree(old)
         else:
             temporary.rename(out)
+    except OSError as error:
+        raise EgolocError(f"{out}: cannot be written: {_reason(error)}") from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _reason(error: OSError) -> str:
+    """The system's words alone: Arrow wraps them into its own."""
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def check_free(out: Path, *, overwrite: bool = False) -> None:
     """Raise EgolocError unless a run folder can be written at `out`."""
     if not out.exists() and not out.is_symlink():
+        _check_place(out)
         return
     if not overwrite:
         raise EgolocError(f"{out}: exists already: choose another --out or add --overwrite")
-    strange = not out.is_dir() or {p.name for p in out.iterdir() if p.suffix != ".rrd"} - FILES
+    strange = out.is_symlink() or not out.is_dir() or {p.name for p in out.iterdir() if p.suffix != ".rrd"} - FILES
     if strange:
         raise EgolocError(f"{out}: --overwrite replaces run folders only, and this is none or holds other files")
+
+
+def _check_place(out: Path) -> None:
+    """Raise where no folder can be made, before a long replay rather than after it."""
+    above = next(parent for parent in out.absolute().parents if parent.exists())
+    if not above.is_dir():
+        raise EgolocError(f"{out}: cannot be written: {above} is a file, expected a folder")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise EgolocError(f"{out}: cannot be written: no permission to write in {above}")
 
 
 def write_tables(folder: Path, run: Run) -> None:
@@ -89,32 +107,25 @@ def write_tables(folder: Path, run: Run) -> None:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """JSON with NaN refused, replaced at once if the file exists."""
     temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-    temporary.replace(path)
-
-
-def load_run(folder: Path) -> tuple[Run, dict[str, Any]]:
-    """The run in a folder, and its whole manifest."""
-    if not folder.is_dir():
-        raise EgolocError(f"{folder}: expected a run folder, as egoloc replay writes it")
-    manifest = read_json(folder / "manifest.json")
-    if not isinstance(manifest.get("facts"), dict):
-        raise EgolocError(f"{folder / 'manifest.json'}: facts: expected an object")
-    states, decisions = (_read_parquet(folder / f"{name}.parquet") for name in ("states", "decisions"))
-    return Run(states, decisions, manifest["facts"]), manifest
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object."""
     try:
-        content = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise EgolocError(f"{path}: missing: expected a run folder, as egoloc replay writes it") from None
-    except ValueError as error:
-        raise EgolocError(f"{path}: expected JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise EgolocError(f"{path}: expected an object, got {type(content).__name__}")
-    return content
+        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        temporary.replace(path)
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def load_run(folder: Path) -> Run:
+    """The run in a folder, with the columns that scoring needs."""
+    if not folder.is_dir():
+        raise EgolocError(f"{folder}: {EXPECTED}")
+    path = folder / "manifest.json"
+    facts = checked(read_json(path), Manifest, path)["facts"]
+    states, decisions = (
+        _arrays(read_table(folder / f"{name}.parquet", columns))
+        for name, columns in (("states", STATES), ("decisions", DECISIONS))
+    )
+    return Run(states, decisions, facts)
 
 
 def versions() -> dict[str, str]:
@@ -130,6 +141,8 @@ def versions() -> dict[str, str]:
 
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, in hex."""
+    if not path.is_file():  # a pipe would be waited for
+        raise EgolocError(f"{path}: expected a file")
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -139,7 +152,8 @@ def _write_parquet(path: Path, columns: Columns) -> None:
 
     table = _arrow_table(columns)
     names = [name for name in columns if name in CODES]
-    pq.write_table(table, path, compression="lz4", use_dictionary=names, write_statistics=False)
+    options = {"compression": "lz4", "write_statistics": False, "write_page_checksum": True}
+    pq.write_table(table, path, use_dictionary=names, **options)
 
 
 def _arrow_table(columns: Columns) -> "pyarrow.Table":
@@ -158,33 +172,16 @@ def _arrow_table(columns: Columns) -> "pyarrow.Table":
     return pa.table(arrays)
 
 
-def _read_parquet(path: Path) -> Columns:
+def _arrays(table: "pyarrow.Table") -> Columns:
     """Every column as an array; dictionary strings as codes again."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    if not path.is_file():
-        raise EgolocError(f"{path}: missing: expected a run folder, as egoloc replay writes it")
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise EgolocError(f"{path}: expected a Parquet file: {str(error).splitlines()[0]}") from None
-    return {name: _column(name, table[name]) for name in table.column_names if not pa.types.is_list(table[name].type)}
+    return {name: _codes(name, table[name]) if name in CODES else table[name].to_numpy() for name in table.column_names}
 
 
-def _column(name: str, column: Any) -> NDArray[Any]:
+def _codes(name: str, column: Any) -> NDArray[np.int8]:
     import pyarrow as pa
 
-    if name in CODES:
-        codes = {member.name.lower(): member.value for member in CODES[name]}
-        whole = column.cast(pa.string()).dictionary_encode().combine_chunks()
-        whole = pa.concat_arrays(whole.chunks) if isinstance(whole, pa.ChunkedArray) else whole
-        numbers = np.array([codes[text] for text in whole.dictionary.to_pylist()], np.int8)
-        return numbers[whole.indices.to_numpy(zero_copy_only=False)] if len(whole) else np.empty(0, np.int8)
-    if pa.types.is_fixed_size_list(column.type):
-        flat = column.combine_chunks()
-        flat = flat if not isinstance(flat, pa.ChunkedArray) else pa.concat_arrays(flat.chunks)
-        values: NDArray[Any] = flat.flatten().to_numpy(zero_copy_only=False)
-        return values.reshape(-1, column.type.list_size)
-    result: NDArray[Any] = column.to_numpy()
-    return result
+    codes = {member.name.lower(): member.value for member in CODES[name]}
+    whole = column.cast(pa.string()).dictionary_encode().combine_chunks()
+    whole = pa.concat_arrays(whole.chunks) if isinstance(whole, pa.ChunkedArray) else whole
+    numbers = np.array([codes[text] for text in whole.dictionary.to_pylist()], np.int8)
+    return numbers[whole.indices.to_numpy(zero_copy_only=False)] if len(whole) else np.empty(0, np.int8)

@@ -18,6 +18,8 @@ PLAIN_WIDTH = 132
 """Columns taken where the output is no terminal."""
 AXES = {"lon": "lon m", "lat": "lat m", "yaw": "yaw deg"}
 DASH = "-"
+MANY = 1000.0
+"""Numbers from here on are written with an exponent, so that no column is cut off."""
 
 METHOD_NAMES = {"gnss": "GNSS-RTK", "egovm": "EgoVM", "fusion": "Fusion"}
 
@@ -44,14 +46,15 @@ def output_console() -> Console:
 
 
 def render(metrics: Metrics, width: int) -> RenderableType:
-    """Methods side by side, hidden stretches if any, then notes."""
+    """Methods side by side, hidden stretches if any, then warnings and notes."""
     groups = [("lon", "lat", "yaw")] if width >= WIDE else [("lon", "lat"), ("yaw",)]
     parts: list[RenderableType] = []
     for axes in groups:
         parts += [_method_table(metrics, axes, gap=2 if width >= WIDE else 1), ""]
     if "hidden" in metrics:
         parts += [_stretch_table(metrics["hidden"]), ""]
-    return Group(*parts, *(Text(note) for note in notes(metrics)))
+    warnings = [Text(f"WARNING: {entry['text']}", style="bold red") for entry in metrics["warnings"]]
+    return Group(*parts, *warnings, *(Text(note) for note in notes(metrics)))
 
 
 def notes(metrics: Metrics) -> Iterator[str]:
@@ -65,8 +68,9 @@ def notes(metrics: Metrics) -> Iterator[str]:
     yield from _unestimated(metrics)
     if "hidden" in metrics:
         yield from _drift(metrics["hidden"])
-    yield _alignment(metrics)
-    for reason, count in metrics["excluded"].items():
+    if metrics["alignment_s"] is not None:  # else a warning says so
+        yield f"Aligned {metrics['alignment_s']:.1f} s after the first IMU sample."
+    for reason, count in metrics["excluded"].items() if metrics["reference"]["kind"] else ():
         yield f"Excluded: {count} epochs: {EXCLUDED_TEXT[reason]}."
     for entry in metrics["left_out"]:
         count = f"{entry['count']} of " if entry["count"] else ""
@@ -104,7 +108,7 @@ def _axis_headers(axis: str) -> list[str]:
 def _axis_cells(axis: Metrics | None) -> list[str]:
     if axis is None:
         return [DASH] * 5
-    return [f"{axis['mae']:.3f}", f"{axis['rmse']:.3f}", *(_percent(share) for share in axis["below"].values())]
+    return [_number(axis["mae"], 3), _number(axis["rmse"], 3), *(_percent(share) for share in axis["below"].values())]
 
 
 def _percent(share: float | None, digits: int = 1) -> str:
@@ -121,13 +125,16 @@ def _stretch_table(hidden: Metrics) -> Table:
         table.add_column(header, justify="right", no_wrap=True)
     for entry in hidden["per_stretch"]:
         error, sigma, since = entry["end_horizontal_m"], entry["end_sigma_m"], entry["since_gnss_s"]
-        ratio = DASH if error is None else f"{error / sigma:.2f}"
+        ratio = DASH if error is None else _number(error / sigma, 2)
         table.add_row(f"{entry['start_s']:.1f}", _number(error, 3), _number(sigma, 3), ratio, _number(since, 1))
     return table
 
 
 def _number(value: float | None, digits: int) -> str:
-    return DASH if value is None else f"{value:.{digits}f}"
+    """Fixed digits as long as the column holds them."""
+    if value is None:
+        return DASH
+    return f"{value:.{digits}f}" if abs(value) < MANY else f"{value:.1e}"
 
 
 def _scored(metrics: Metrics) -> str:
@@ -165,20 +172,18 @@ def _drift(hidden: Metrics) -> Iterator[str]:
         yield f"{hidden['without_end']} stretches have no fixed fix or no state at their end."
 
 
-def _alignment(metrics: Metrics) -> str:
-    after = metrics["alignment_s"]
-    return "The filter never aligned." if after is None else f"Aligned {after:.1f} s after the first IMU sample."
-
-
 def bench_table(result: Metrics) -> Table:
-    """A benchmark's rows and how many times faster egoloc is."""
+    """A benchmark's rows, how many times a peer egoloc makes, and the other ratios on lines of their own."""
     table = _bare_table(2)
     table.add_column("name")
     table.add_column("metric")
-    for header in ("median", "min", "max", "egoloc is x faster"):
+    for header in ("median", "min", "max", "ratio"):
         table.add_column(header, justify="right")
+    ratios = dict(result["ratios"])
     for row in result["rows"]:
-        ratio = result["ratios"].get(row["name"])
+        ratio = ratios.pop(row["name"], None)
         figures = [f"{row[key]:.4g}" for key in ("median", "min", "max")]
         table.add_row(row["name"], row["metric"], *figures, "" if ratio is None else f"{ratio:.3g}")
+    for name, ratio in ratios.items():
+        table.add_row(name, "", "", "", "", f"{ratio:.3g}")
     return table

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,8 @@ def write_recording(run: Path, rrd: Path | None = None, other: Path | None = Non
     runs = [load_columns(folder) for folder in ([run] if other is None else [run, other])]
     beside = run.resolve().with_name(f"{runs[0].name}_and_{runs[-1].name}.rrd")
     target = rrd or (run / "run.rrd" if other is None else beside)
+    if target.suffix != ".rrd":  # it is replaced if it exists: it must not be a log
+        raise EgolocError(f"{target}: expected a file name that ends in .rrd")
     span_ns = _common_span(runs, [run, other or run])
     place = _place(runs)
     roots = ["run"] if other is None else ["A", "B"]
@@ -40,10 +43,12 @@ def write_recording(run: Path, rrd: Path | None = None, other: Path | None = Non
         recording.flush()
         recording.disconnect()
         part.replace(target)
-    except OSError as error:
-        raise EgolocError(f"{target}: cannot be written: {error.strerror}") from None
+    except (OSError, RuntimeError) as error:  # rerun's own, where the disk is full
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise EgolocError(f"{target}: cannot be written: {reason}") from None
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
     return target
 
 

@@ -36,6 +36,8 @@ class MapFrame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if self.kind == "utm" and not 1 <= self.zone <= 60:
             raise EgolocError(f"map frame: zone: expected 1..60, got {self.zone}")
+        if not np.isfinite(self.origin).all():
+            raise EgolocError(f"map frame: origin: expected finite numbers, got {self.origin}")
         if self.kind == "enu" and not (abs(self.origin[0]) <= 90 and abs(self.origin[1]) <= 360):
             raise EgolocError(f"map frame: origin: expected latitude and longitude in degrees, got {self.origin}")
 

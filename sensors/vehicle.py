@@ -4,8 +4,9 @@ from typing import Literal
 
 import msgspec
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+from sensors.bounds import Delay, Lever, NonNegative, Positive
+
+Vector3 = tuple[Lever, Lever, Lever]
 
 
 class ImuSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -14,19 +15,19 @@ class ImuSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str = "epson-g320n"
     samples: Literal["rate", "increment"] = "rate"
     """rate: instantaneous at the stamp; increment: mean over the interval that ends at the stamp."""
-    gyro_noise_deg_per_sqrt_h: float = 0.1
+    gyro_noise_deg_per_sqrt_h: NonNegative = 0.1
     """Angle random walk, deg/sqrt(h)."""
-    accel_noise_m_per_s_per_sqrt_h: float = 0.05
+    accel_noise_m_per_s_per_sqrt_h: NonNegative = 0.05
     """Velocity random walk, m/s/sqrt(h)."""
-    gyro_bias_instability_deg_per_h: float = 3.5
+    gyro_bias_instability_deg_per_h: NonNegative = 3.5
     """Standard deviation of the drifting gyro bias (first-order Gauss-Markov), deg/h."""
-    accel_bias_instability_mg: float = 0.1
+    accel_bias_instability_mg: NonNegative = 0.1
     """Standard deviation of the drifting accelerometer bias (first-order Gauss-Markov), milli-g."""
-    bias_time_constant_s: float = 1000.0
+    bias_time_constant_s: Positive = 1000.0
     """Correlation time of both drifting biases, s."""
-    gyro_turn_on_bias_deg_per_h: float = 360.0
+    gyro_turn_on_bias_deg_per_h: NonNegative = 360.0
     """Standard deviation of the constant gyro bias at power-on, deg/h."""
-    accel_turn_on_bias_mg: float = 5.0
+    accel_turn_on_bias_mg: NonNegative = 5.0
     """Standard deviation of the constant accelerometer bias at power-on, milli-g."""
 
 
@@ -39,7 +40,7 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     imu: ImuSpec = ImuSpec()
     gnss_lever_arm: Vector3 = (0.0, 0.0, 0.0)
     """Main GNSS antenna, m, body frame."""
-    gnss_lever_arm_sigma_m: float = 0.0
+    gnss_lever_arm_sigma_m: NonNegative = 0.0
     """How well the antenna's place is known (each axis), m."""
     pose_lever_arm: Vector3 = (0.0, 0.0, 0.0)
     """Point whose pose EgoVM reports, m, body frame."""
@@ -47,9 +48,9 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Point that moves along the vehicle's axis (non-holonomic constraint, wheel speed), m, body frame."""
     reference_lever_arm: Vector3 = (0.0, 0.0, 0.0)
     """Point whose trajectory the reference gives, m, body frame."""
-    gnss_delay_s: float = 0.0
+    gnss_delay_s: Delay = 0.0
     """GNSS positions are true this long before their stamp, s (negative: after it)."""
-    gnss_velocity_delay_s: float = 0.0
+    gnss_velocity_delay_s: Delay = 0.0
     """GNSS velocities are true this long before their stamp, s."""
     land_vehicle: bool = True
     """Wheels that do not slip sideways: zero-velocity and non-holonomic updates apply."""

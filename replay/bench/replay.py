@@ -2,8 +2,8 @@
 
 The log: simulated, 100 Hz IMU and reference, 10 Hz GNSS (position and velocity) and pose fixes, zstd. Timed: the whole
 of ``replay_file`` (hashing, reading, fusing, scoring, writing the run folder) after one call that warms up; imports are
-not counted. Peak memory is that of a fresh process that replays the first length once. The metrics alone are timed over a
-million epochs.
+not counted. Peak memory is that of a fresh process that replays the first length once. The metrics alone are timed over
+a million epochs.
 """
 
 import resource

@@ -34,6 +34,8 @@ class Convert:
         from sensors.mcap.io import write_log
 
         _check_new(self.log, overwrite=self.overwrite)
+        if self.log.exists() and self.source.exists() and self.log.samefile(self.source):
+            raise EgolocError(f"{self.log}: expected a log to write, got the source itself")
         with stage(f"reading {self.source}"):
             log = load(self.format, self.source)
             if self.reference is not None:

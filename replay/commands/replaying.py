@@ -82,6 +82,8 @@ class Replay:
         repeated = [stem for stem, n in Counter(log.stem for log in self.logs).items() if n > 1]
         if repeated:
             raise EgolocError(f"replay: expected logs of different names, got {repeated[0]!r} twice")
+        if (self.out / "manifest.json").exists():
+            raise EgolocError(f"{self.out}: is a run folder: choose another --out to hold the runs of several logs")
         return {log: self.out / log.stem for log in self.logs}
 
 
@@ -101,8 +103,10 @@ class Score:
         from replay.scoring import score
         from replay.store import load_run, write_json
 
-        run, _manifest = load_run(self.folder)
-        limits = named_limits(self.limits) if self.limits else load_config(self.folder / "config.toml").limits
+        run = load_run(self.folder)
+        limits = (
+            named_limits(self.limits) if self.limits is not None else load_config(self.folder / "config.toml").limits
+        )
         metrics = score(run, limits)
         write_json(self.folder / "metrics.json", metrics)
         if self.json:
@@ -123,7 +127,8 @@ class Demo:
     def run(self, arguments: tuple[str, ...]) -> None:
         from replay.config import RunConfig
         from replay.harness import replay_file
-        from replay.store import check_free, read_json
+        from replay.run_files import read_json
+        from replay.store import check_free
         from sensors.mcap.io import write_log
         from sensors.simulate.drive import simulate
         from sensors.simulate.scenarios import load

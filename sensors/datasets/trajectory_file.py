@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 
 APPLANIX_ZONE = 17
 """UTM zone of an Applanix file where no UTM map frame says otherwise (Toronto, where Boreas was driven), north."""
+MAX_COORDINATE = 2e7
+"""Of a point on a map, m; no coordinate on earth is larger."""
 _APPLANIX = ("GPSTime", "easting", "northing", "altitude", "roll", "pitch", "heading")
 _TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _TIMES = {"t_ns": 1, "t_s": 10**9}
@@ -64,9 +66,8 @@ def _tum(path: Path, text: str, frame: MapFrame | None) -> Placed:
     cells = [row for _, row in rows]
     values = numbers(path, _TUM, cells)
     t_ns = _exact_ns(path, "t", [row[0] for row in cells], 10**9)
-    keep = _usable(path, t_ns, values)
-    q = values[keep, 4:] / np.linalg.norm(values[keep, 4:], axis=1, keepdims=True)
-    return Trajectory(t_ns[keep], t_ns[keep], values[keep, 1:4], q), frame
+    keep = _usable(path, t_ns, values, values[:, 1:4])
+    return Trajectory(t_ns[keep], t_ns[keep], values[keep, 1:4], _unit(values[keep, 4:])), frame
 
 
 def _csv(path: Path, header: list[str], rows: list[list[str]], frame: MapFrame | None) -> Placed:
@@ -81,7 +82,7 @@ def _csv(path: Path, header: list[str], rows: list[list[str]], frame: MapFrame |
                 f"{path}: column {name}: not there; expected x, y or lat_deg, lon_deg in {', '.join(header)}"
             )
     position = np.stack([column.get(name, np.zeros(len(values))) for name in names], axis=1)
-    keep = _usable(path, t_ns, position)
+    keep = _usable(path, t_ns, position, position)
     q, sigma = _attitude(path, column), _sigma(column)
     q, sigma = (None if x is None else x[keep] for x in (q, sigma))
     t, position = t_ns[keep], position[keep]
@@ -120,9 +121,7 @@ def _attitude(path: Path, column: dict[str, Floats]) -> Floats | None:
         missing = [name for name in _QUATERNION if name not in column]
         if missing:
             raise EgolocError(f"{path}: column {missing[0]}: not there beside {', '.join(given)}")
-        q = np.stack([column[name] for name in _QUATERNION], axis=1)
-        norm = np.linalg.norm(q, axis=1, keepdims=True)
-        return np.where(norm > 0.5, q / np.where(norm > 0.5, norm, 1.0), np.nan)
+        return _unit(np.stack([column[name] for name in _QUATERNION], axis=1))
     roll, pitch, yaw = (_angle(column, name) for name in ("roll", "pitch", "yaw"))
     if yaw is None:
         if roll is not None or pitch is not None:
@@ -134,6 +133,12 @@ def _attitude(path: Path, column: dict[str, Floats]) -> Floats | None:
     q = np.full((len(yaw), 4), np.nan)
     q[known] = q_from_rpy(*angles[:, known])
     return q
+
+
+def _unit(q: Floats) -> Floats:
+    """(N, 4) quaternions of unit length; NaN where they are no rotation (zeros)."""
+    norm = np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(norm > 0.5, q / np.where(norm > 0.5, norm, 1.0), np.nan)
 
 
 def _angle(column: dict[str, Floats], name: str) -> Floats | None:
@@ -165,7 +170,7 @@ def _applanix(path: Path, header: list[str], rows: list[list[str]], frame: MapFr
     values = numbers(path, header, rows)
     t_ns = _exact_ns(path, "GPSTime", [row[header.index("GPSTime")] for row in rows], 1000)
     chosen = values[:, [header.index(name) for name in _APPLANIX]]
-    keep = _usable(path, t_ns, chosen)
+    keep = _usable(path, t_ns, chosen, chosen[:, 1:4])
     t, utm = t_ns[keep], chosen[keep, 1:4]
     roll, pitch, heading = chosen[keep, 4:7].T
     q = q_from_rpy(-roll, pitch, _turn_to_travel(t, utm, heading) - heading)
@@ -189,9 +194,13 @@ def _turn_to_travel(t_ns: Nanoseconds, p: Floats, heading: Floats) -> float:
     return float(middle + np.median(wrap(turn - middle)))
 
 
-def _usable(path: Path, t_ns: Nanoseconds, values: Floats) -> NDArray[np.bool_]:
-    """Finite rows with increasing stamps; what is left out is logged."""
-    keep, left_out = screen(path.name, t_ns, t_ns, {"not finite": np.all(np.isfinite(values), axis=1)})
+def _usable(path: Path, t_ns: Nanoseconds, values: Floats, position: Floats) -> NDArray[np.bool_]:
+    """Finite rows on earth with increasing stamps; what is left out is logged."""
+    checks = {
+        "not finite": np.all(np.isfinite(values), axis=1),
+        f"position beyond {MAX_COORDINATE:g}": np.all(np.abs(position) <= MAX_COORDINATE, axis=1),
+    }
+    keep, left_out = screen(path.name, t_ns, t_ns, checks)
     for rows in left_out:
         log.warning("%s: %d rows left out: %s", path, rows.count, rows.reason)
     if not keep.any():

@@ -10,10 +10,11 @@ import numpy as np
 
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
+from sensors.mcap.cdr import short_name
 from sensors.mcap.decode import DECODERS
 from sensors.mcap.gather import Gatherer
 from sensors.mcap.sections import Container
-from sensors.mcap.topics import Roles
+from sensors.mcap.topics import Roles, feeds
 from sensors.records import LeftOut, Log
 from sensors.vehicle import Vehicle
 
@@ -36,10 +37,20 @@ def assemble(source: Container, gatherer: Gatherer, roles: Roles) -> Log:
         for sensor, topic in roles.sensors.items():
             found[sensor], dropped = DECODERS[sensor](topic)
             left_out += [row for row in dropped if row not in left_out]
-            if topic.count == 0:
-                left_out.append(LeftOut(topic.name, "no messages", 0))
+    left_out += _ignored(gatherer, roles)
     facts, problem = _facts(source)
     return Log(**found, vehicle=facts.vehicle, map_frame=facts.map_frame, left_out=(*left_out, *problem))
+
+
+def _ignored(gatherer: Gatherer, roles: Roles) -> list[LeftOut]:
+    """Topics of a sensor's schema that feed none, and chosen ones without messages."""
+    reasons = dict(roles.ignored)
+    reasons |= {topic.name: "no messages" for topic in roles.sensors.values() if topic.count == 0}
+    return [
+        LeftOut(topic.name, reasons[topic.name], topic.count)
+        for topic in gatherer.topics
+        if topic.name in reasons and not topic.unreadable and feeds(short_name(topic.schema.name))
+    ]
 
 
 def damage(source: Container, gatherer: Gatherer) -> list[LeftOut]:

@@ -7,7 +7,7 @@ Heading: GPSFix ``dip`` (deg clockwise from north; the third of its device angle
 Altitude is taken as height above the ellipsoid.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,14 +52,20 @@ DEFAULT_VELOCITY_SIGMA = (0.1, 0.2)
 _FIXED_SIGMA = 0.05
 _STATUS = {-1: 0, 0: 1, 1: 2, 2: 3, 18: 2, 19: 4, 20: 3, 33: 2}
 _MAX_VARIANCE = 1e12
+MAX_RATE, MAX_FORCE, MAX_SPEED = 100.0, 1000.0, 1000.0
+"""Beyond these no vehicle moves: rad/s, m/s^2 (100 g) and m/s. One such sample would throw the filter off for good."""
+MAX_ALTITUDE, MAX_COORDINATE = 1e5, 2e7
+"""Of a fix and of a point on a map, m."""
+MAX_LATITUDE = 89.99
+"""Nearer the pole there is hardly an east, deg."""
 
 
 def decode_imu(topic: Topic) -> Decoded:
     """sensor_msgs/Imu; a first covariance element of -1 marks a quantity that is not measured."""
     gyro, accel = topic.column("gyro"), topic.column("accel")
     valid = {
-        "angular_velocity is not finite": _finite(gyro),
-        "linear_acceleration is not finite": _finite(accel),
+        **_sane("angular_velocity", gyro, MAX_RATE, "rad/s"),
+        **_sane("linear_acceleration", accel, MAX_FORCE, "m/s^2"),
         "angular_velocity is marked as not measured (covariance -1)": topic.column("gyro_known") != -1,
         "linear_acceleration is marked as not measured (covariance -1)": topic.column("accel_known") != -1,
     }
@@ -79,7 +85,9 @@ def decode_gnss(topic: Topic) -> Decoded:
     cov = np.where(known[:, None, None], given, _default_covariance(topic, status))
     valid = {
         "latitude, longitude or altitude is not finite": _finite(degrees),
-        "latitude or longitude is out of range": (np.abs(degrees[:, 0]) <= 90) & (np.abs(degrees[:, 1]) <= 360),
+        "latitude or longitude is out of range": _inside(degrees[:, :2], (MAX_LATITUDE, 360.0)),
+        "latitude and longitude are both zero": (degrees[:, 0] != 0.0) | (degrees[:, 1] != 0.0),
+        f"altitude is beyond {MAX_ALTITUDE:g} m": _inside(degrees[:, 2:], (MAX_ALTITUDE,)),
         **_covariance_valid("position_covariance", cov),
     }
     llh = np.column_stack((np.radians(degrees[:, :2]), degrees[:, 2]))
@@ -113,7 +121,7 @@ def decode_gnss_velocity(topic: Topic) -> Decoded:
     if topic.has_column("motion"):
         return _decode_motion(topic)
     vel, cov = topic.column("vel"), topic.column("cov").reshape(-1, 3, 3)
-    valid = {"twist.linear is not finite": _finite(vel), **_covariance_valid("twist.covariance", cov)}
+    valid = _sane("twist.linear", vel, MAX_SPEED, "m/s") | _covariance_valid("twist.covariance", cov)
     return _build(GnssVelocity, topic, {"vel_enu": vel, "cov_enu": cov}, valid)
 
 
@@ -136,8 +144,12 @@ def _decode_motion(topic: Topic) -> Decoded:
     cov[:, 1, 1] = (cosine * along) ** 2 + (sine * across) ** 2
     cov[:, 0, 1] = cov[:, 1, 0] = sine * cosine * (along**2 - across**2)
     cov[:, 2, 2] = up**2
-    valid = {"speed, track or climb is not finite": finite, **_covariance_valid("err_speed or err_climb", cov)}
     vel = np.column_stack((speed * sine, speed * cosine, climb))
+    valid = {
+        "speed, track or climb is not finite": finite,
+        f"speed or climb is beyond {MAX_SPEED:g} m/s": _inside(vel, (MAX_SPEED,) * 3),
+        **_covariance_valid("err_speed or err_climb", cov),
+    }
     return _build(GnssVelocity, topic, {"vel_enu": vel, "cov_enu": cov}, valid)
 
 
@@ -146,7 +158,7 @@ def decode_pose_fixes(topic: Topic) -> Decoded:
     p, cov = topic.column("p"), topic.column("cov").reshape(-1, 3, 3)
     q, rotates = _unit(topic.column("q"))
     valid = {
-        "pose.position is not finite": _finite(p[:, :2]),
+        **_sane("pose.position", p[:, :2], MAX_COORDINATE, "m"),
         "pose.orientation is not a unit quaternion": rotates,
         **_covariance_valid("pose.covariance of x, y, yaw", cov),
     }
@@ -158,7 +170,8 @@ def decode_wheel(topic: Topic) -> Decoded:
     """TwistWithCovarianceStamped in body axes: linear.x and its variance."""
     speed, variance = topic.column("speed"), topic.column("variance")
     measured = np.isfinite(variance) & (variance > 0)
-    valid = {"twist.linear.x is not finite": np.isfinite(speed), "twist.covariance[0] is not positive": measured}
+    valid = _sane("twist.linear.x", speed[:, None], MAX_SPEED, "m/s")
+    valid["twist.covariance[0] is not positive"] = measured
     sigma = np.sqrt(np.where(measured, variance, 1.0))
     return _build(WheelSpeed, topic, {"speed": speed, "sigma": sigma}, valid)
 
@@ -178,7 +191,7 @@ def decode_reference(topic: Topic) -> Decoded:
     for k, chosen in enumerate((np.where(np.minimum(x, y) >= 0, np.maximum(x, y), -1.0), yaw)):
         known = filled_in & np.isfinite(chosen) & (chosen >= 0)
         sigma[:, k] = np.sqrt(np.where(known, chosen, np.nan))
-    valid = {"pose.position is not finite": _finite(p)}
+    valid = _sane("pose.position", p, MAX_COORDINATE, "m")
     return _build(Trajectory, topic, {"p_map": p, "q_map_body": q, "sigma": sigma}, valid, late=False)
 
 
@@ -232,6 +245,21 @@ def _finite(values: Floats) -> Mask:
     for column in values.T:
         result &= np.isfinite(column)
     return result
+
+
+def _inside(values: Floats, largest: Sequence[float]) -> Mask:
+    """(N,) rows of (N, k) whose magnitudes are finite and at most the largest of their columns."""
+    result = np.ones(len(values), bool)
+    for column, bound in zip(values.T, largest, strict=True):
+        result &= np.abs(column) <= bound
+    return result
+
+
+def _sane(label: str, values: Floats, largest: float, unit: str) -> dict[str, Mask]:
+    """Reasons why rows of (N, k) quantities cannot be used."""
+    inside = _inside(values, (largest,) * values.shape[1])
+    finite = inside if inside.all() else _finite(values)
+    return {f"{label} is not finite": finite, f"{label} is beyond {largest:g} {unit}": inside}
 
 
 def _covariance_valid(label: str, cov: Floats) -> dict[str, Mask]:

@@ -3,6 +3,7 @@
 import os
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -56,4 +57,5 @@ def write_log(path: str | os.PathLike[str], log: Log, compression: Compression =
     except OSError as error:
         raise EgolocError(f"{target}: cannot be written: {error.strerror or error}") from None
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # where nothing could be written there is nothing to clear away
+            partial.unlink(missing_ok=True)

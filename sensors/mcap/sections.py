@@ -5,6 +5,7 @@ The file is mapped, and pages behind the walk are given back, so memory does not
 
 import mmap
 import os
+import stat
 import zlib
 from bisect import bisect_right
 from collections import Counter
@@ -171,6 +172,8 @@ def open_container(path: str | os.PathLike[str]) -> Container:
     """Map an MCAP file; EgolocError where it is missing, empty or something else."""
     source = Path(path)
     try:
+        if not stat.S_ISREG(source.stat().st_mode):  # a pipe would be waited for
+            raise EgolocError(f"{source}: expected an MCAP log, got {'a folder' if source.is_dir() else 'no file'}")
         with source.open("rb") as stream:
             if os.fstat(stream.fileno()).st_size == 0:
                 raise EgolocError(f"{source}: the file is empty, expected an MCAP log")

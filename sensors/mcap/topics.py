@@ -86,6 +86,11 @@ _COLUMNS: dict[tuple[str, str], Mapping[str, Sequence[str]]] = {
 }
 
 
+def feeds(schema: str) -> tuple[str, ...]:
+    """Sensors that a schema (``pkg/Type``) can feed."""
+    return _FEEDS.get(schema, ())
+
+
 def check_choice(chosen: Mapping[str, str]) -> None:
     """Raise unless every key names a sensor."""
     for sensor in set(chosen) - set(SENSORS):

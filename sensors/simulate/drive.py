@@ -7,11 +7,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors.bounds import Latitude, Longitude
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame, utm_frame
 from sensors.records import Log
-from sensors.simulate.bounds import Latitude, Longitude
 from sensors.simulate.driver import Driver, drive_profile
 from sensors.simulate.gnss import GnssSimulation, simulate_gnss
 from sensors.simulate.imu import ImuBiases, ImuSimulation, simulate_imu
@@ -23,7 +23,7 @@ from sensors.simulate.trajectory import MARGIN_S, Truth
 from sensors.simulate.wheel import WheelSimulation, simulate_wheel
 from sensors.vehicle import Vehicle
 
-SHORTEST_S = 1.0
+SHORTEST_S, LONGEST_S = 1.0, 7 * 86_400.0
 
 
 class Start(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -77,8 +77,10 @@ def simulate_drive(duration_s: float = 600.0, seed: int = 0, config: DriveConfig
 
 def city_truth(duration_s: float, seed: int, config: DriveConfig) -> Truth:
     """The exact motion of a drive through a random city."""
-    if not SHORTEST_S <= duration_s < np.inf:
-        raise EgolocError(f"simulate: duration: expected at least {SHORTEST_S:g} s, got {duration_s:g}")
+    if not SHORTEST_S <= duration_s <= LONGEST_S:
+        raise EgolocError(
+            f"simulate: duration: expected at least {SHORTEST_S:g} s, at most a week, got {duration_s:g} s"
+        )
     if seed < 0:
         raise EgolocError(f"simulate: seed: expected 0 or more, got {seed}")
     rng = stream(seed, "route")

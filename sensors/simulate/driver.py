@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sensors.simulate.bounds import NonNegative, Positive
+from sensors.bounds import NonNegative, Positive
 from sensors.simulate.route import Route
 from sensors.simulate.trajectory import KNOT_S, MARGIN_S, Profile
 

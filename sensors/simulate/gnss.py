@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors.bounds import Fraction, NonNegative, Positive
 from sensors.geodesy import ecef_from_llh, llh_from_ecef, rotation_ecef_enu
 from sensors.records import GnssFix, GnssStatus, GnssVelocity
 from sensors.rotation import wrap, yaw_from_q
-from sensors.simulate.bounds import Fraction, NonNegative, Positive
 from sensors.simulate.noise import Rng, correlated, delayed
 from sensors.simulate.trajectory import Motion
 from sensors.vehicle import Vehicle

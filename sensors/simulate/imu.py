@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors.bounds import NonNegative
 from sensors.records import Imu
-from sensors.simulate.bounds import NonNegative
 from sensors.simulate.noise import Rng, gauss_markov
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import ImuSpec

@@ -5,10 +5,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from sensors.bounds import Fraction, NonNegative, Positive, check_order
 from sensors.geodesy import MapFrame, map_from_llh
 from sensors.records import PoseFix
 from sensors.rotation import wrap, yaw_from_q
-from sensors.simulate.bounds import Fraction, NonNegative, Positive, check_order
 from sensors.simulate.noise import Rng, correlated, delayed, gauss_markov
 from sensors.simulate.reference import attitude_in_map
 from sensors.simulate.trajectory import Motion

@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors.bounds import Positive
 from sensors.geodesy import MapFrame, map_from_llh, rotation_map_enu
 from sensors.records import Trajectory
 from sensors.rotation import multiply, q_from_matrix
-from sensors.simulate.bounds import Positive
 from sensors.simulate.trajectory import Motion, Truth
 from sensors.vehicle import Vehicle
 

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sensors.simulate.bounds import Fraction, NonNegative, Positive, check_order
+from sensors.bounds import Fraction, NonNegative, Positive, check_order
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator

@@ -4,9 +4,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors.bounds import NonNegative, Positive
 from sensors.records import WheelSpeed
 from sensors.rotation import matrix_from_q
-from sensors.simulate.bounds import NonNegative, Positive
 from sensors.simulate.noise import Rng, delayed
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import Vehicle

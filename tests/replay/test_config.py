@@ -14,7 +14,7 @@ from sensors.geodesy import MapFrame
 from sensors.vehicle import Vehicle
 
 FULL = RunConfig(
-    topics={"imu": "/imu/data", "odd key": 'quo"te\\ß'},
+    topics={"imu": "/imu/data", "gnss": 'quo"te\\ß'},
     vehicle=Vehicle(gnss_lever_arm=(0.5, -0.1, 1.2), gnss_delay_s=-0.125),
     map_frame=MapFrame("utm", (5e5, 1e-7, 0.0), 32),
     fusion=FusionConfig(output_hz=20.0, gnss=GnssModel(use=False)),

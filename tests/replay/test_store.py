@@ -46,7 +46,7 @@ def save(folder: Path, run: Run) -> None:
 def test_scoring_a_saved_run_gives_the_same_bytes(hide: bool, tmp_path: Path) -> None:
     run = made(hide=hide)
     save(tmp_path, run)
-    again, _ = load_run(tmp_path)
+    again = load_run(tmp_path)
     limits = RunConfig().limits
     assert json.dumps(score(again, limits)) == json.dumps(score(run, limits))
     for table in ("states", "decisions"):
@@ -113,7 +113,7 @@ def test_only_run_folders_are_overwritten(tmp_path: Path) -> None:
     [
         (lambda run: (run / "manifest.json").unlink(), "manifest.json: missing"),
         (lambda run: (run / "manifest.json").write_text("{"), "manifest.json: expected JSON"),
-        (lambda run: (run / "manifest.json").write_text("{}"), "manifest.json: facts: expected an object"),
+        (lambda run: (run / "manifest.json").write_text("{}"), "manifest.json: object missing required field `facts`"),
         (lambda run: (run / "states.parquet").unlink(), "states.parquet: missing"),
         (lambda run: (run / "decisions.parquet").write_bytes(b"PAR1"), "decisions.parquet: expected a Parquet file"),
     ],

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import msgspec
 
+from sensors.bounds import Positive
 from sensors.errors import EgolocError
-from sensors.simulate.bounds import Positive
 from sensors.simulate.drive import DriveConfig
 
 

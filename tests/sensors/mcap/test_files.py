@@ -88,7 +88,7 @@ def test_files_that_are_no_log(tmp_path: Path, content: bytes | None, reason: st
         with pytest.raises(EgolocError, match=rf"bad\.mcap: {reason}") as caught:
             read(path)
         assert "\n" not in str(caught.value)
-    with pytest.raises(EgolocError, match="cannot be read: Is a directory"):
+    with pytest.raises(EgolocError, match="expected an MCAP log, got a folder"):
         read_log(tmp_path)
 
 
