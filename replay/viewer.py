@@ -20,6 +20,9 @@ from replay.run_columns import AXES, RunColumns, load_columns
 from replay.run_summary import facts, summary
 from sensors.errors import EgolocError
 
+WRITING_S = 300.0
+"""Longest wait for the disk; without it rerun waits for ever."""
+
 
 def write_recording(run: Path, rrd: Path | None = None, other: Path | None = None) -> Path:
     """The recording of one run, or of two on one timeline, from their folders alone; returns its path.
@@ -40,7 +43,7 @@ def write_recording(run: Path, rrd: Path | None = None, other: Path | None = Non
         recording = rr.RecordingStream("egoloc" if other is None else "egoloc_two_runs")
         recording.save(part, default_blueprint=arrange(_scene(runs, roots, span_ns, place)))
         _draw(recording, runs, roots, span_ns, place)
-        recording.flush()
+        recording.flush(timeout_sec=WRITING_S)
         recording.disconnect()
         part.replace(target)
     except (OSError, RuntimeError) as error:  # rerun's own, where the disk is full

@@ -1,0 +1,39 @@
+"""KITTI sequence 00 of the gtsam wheel, with its pauses in the IMU, through the whole replay."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fusion.config import FusionConfig, MotionModel
+from replay.config import HideGnss, RunConfig
+from replay.harness import replay_log
+from sensors.datasets import load
+from sensors.records import Log
+
+WIDE = FusionConfig(motion=MotionModel(lateral_sigma=0.2, sigma_per_speed=0.02))
+"""As docs/datasets.md says."""
+
+
+@pytest.fixture(scope="module")
+def kitti() -> Log:
+    found = find_spec("gtsam")
+    if found is None or not found.submodule_search_locations:
+        pytest.skip("gtsam is not installed: pip install 'egoloc[bench]'")
+    return load("gtsam-kitti", Path(found.submodule_search_locations[0]) / "Data")
+
+
+def test_no_position_of_the_drive_is_rejected(kitti: Log) -> None:
+    counts = replay_log(kitti, RunConfig(fusion=WIDE)).metrics["decisions"]["gnss_position"]
+    assert counts["accepted"] >= 465
+    assert "chi_square" not in counts
+
+
+def test_drift_over_hidden_seconds_is_as_large_as_stated(kitti: Log) -> None:
+    config = msgspec.structs.replace(RunConfig(fusion=WIDE), hide_gnss=HideGnss(30.0, 5.0))
+    hidden = replay_log(kitti, config).metrics["hidden"]
+    assert hidden["stretches"] == 15
+    assert hidden["end_horizontal_m"]["p50"] < 0.6
+    assert hidden["end_horizontal_m"]["max"] < 1.5
+    assert 0.5 < hidden["end_error_over_sigma_rms"] < 1.5
