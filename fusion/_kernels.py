@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._linalg import Vector, attitude, axpy, blend, matvec
-from fusion.covariance import accumulate, coast, propagate
+from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
 from fusion.measurements import body_velocity, gnss_position, gnss_velocity, pose_fix, wrap, yaw_row
@@ -31,6 +31,8 @@ _COVARIANCE = int(Reason.COVARIANCE)
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
+_GAP_STEP_NS = 50_000_000
+"""A gap is crossed in steps of at most this."""
 Part = tuple[Interval, float, float, float]
 """Part a..b of an interval (0..1) and its length in seconds."""
 
@@ -62,25 +64,33 @@ def process(
         f: Vector = (accel[i, 0], accel[i, 1], accel[i, 2])
         # the sample before the last one serves where the spacing is even to a quarter
         clock[C_BEND] = int(clock[C_INTERVAL] > 0 and 3 * whole <= 4 * clock[C_INTERVAL] <= 5 * whole)
+        gap = whole > par.max_gap_ns
         interval = _interval(core.last, clock[C_BEND] != 0, par.increments, w, f)
         remembered = False
         while True:
             now = clock[C_STATE]
-            stop = ev.t[e] if e < events and ev.t[e] < t else t
+            target = ev.t[e] if e < events and ev.t[e] < t else t
+            stop = min(target, now + _GAP_STEP_NS) if gap else target
             if stop > now:
-                if whole > par.max_gap_ns:
+                if whole > par.bridge_ns:
                     _coast(core, par, (stop - now) * 1e-9)
                 else:
                     part = (interval, (now - start) / whole, (stop - start) / whole, (stop - now) * 1e-9)
                     _advance(nav, earth, acc, span, part)
+                    if gap:
+                        propagate(nav, earth, core.P, acc, span, (core.phi, core.M, core.Mt), par.noise)
+                        widen(core.P, (stop - now) * 1e-9, par.coast_accel, par.coast_rate)
                 clock[C_STATE] = stop
             if stop == t and not remembered:
                 _remember(core, t, w, f)
                 remembered = True
+            if stop < target:
+                continue
             if e >= events or ev.t[e] > stop:
                 break
             rate = blend(interval[0], interval[1], (stop - start) / whole) if whole > 0 else w
-            _handle(core, rec, par, m, ev, e, axpy(-1.0, (nav[10], nav[11], nav[12]), rate))
+            if not (gap and ev.kind[e] == MOTION):  # the rate in a gap is a guess
+                _handle(core, rec, par, m, ev, e, axpy(-1.0, (nav[10], nav[11], nav[12]), rate))
             e += 1
     return e
 

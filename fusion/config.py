@@ -26,11 +26,13 @@ class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     noise_scale: NonNegative = 2.0
     """White noise of gyro and accelerometer, times the datasheet's (vibration, quantization), -."""
     max_gap_s: Positive = 0.5
-    """A longer pause in the IMU is coasted over at constant velocity, s."""
+    """A longer pause in the IMU is a gap: P widens, no motion updates, s."""
+    max_bridge_s: Positive = 3.0
+    """A gap up to this long is bridged along straight lines of rate and force, a longer one at constant velocity, s."""
     coast_accel: Positive = 3.0
-    """Random walk of velocity while coasting, m/s/sqrt(s)."""
+    """Random walk of velocity in a gap, m/s/sqrt(s)."""
     coast_rate_deg: Positive = 20.0
-    """Random walk of yaw while coasting (a tenth of it tilts), deg/sqrt(s)."""
+    """Random walk of yaw in a gap (a tenth of it tilts), deg/sqrt(s)."""
 
 
 class GnssModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

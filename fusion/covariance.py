@@ -145,13 +145,19 @@ def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float) -> None:
 
 @kernel()
 def coast(P: Floats, seconds: float, accel: float, rate: float) -> None:
-    """Widen P over a gap in the IMU: velocity and attitude walk by accel (m/s) and rate (rad) in the first second."""
+    """Propagate P over a gap in the IMU at constant velocity, and widen it."""
     for i in range(15):
         for k in range(3):
             P[k, i] += seconds * P[3 + k, i]
     for i in range(15):
         for k in range(3):
             P[i, k] += seconds * P[i, 3 + k]
+    widen(P, seconds, accel, rate)
+
+
+@kernel()
+def widen(P: Floats, seconds: float, accel: float, rate: float) -> None:
+    """What a gap in the IMU hides: velocity and attitude walk by accel (m/s) and rate (rad) in the first second."""
     qa, qg = accel * accel * seconds, rate * rate * seconds
     for k in range(3):
         P[k, k] += qa * seconds * seconds / 3.0

@@ -21,6 +21,7 @@ class Parameters(NamedTuple):
     noise: Noise
     increments: bool
     max_gap_ns: int
+    bridge_ns: int
     coast_accel: float
     coast_rate: float
     gate: Vector

@@ -64,7 +64,7 @@ def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
     early = unused(found, before, Reason.BEFORE_ALIGNMENT, initial)
     late = unused(found, order[found.t_ns[order] > last], Reason.OUTSIDE_IMU)
     gaps = int((np.diff(imu.t_ns) > config.imu.max_gap_s * 1e9).sum())
-    notes = (LeftOut("imu", f"gap over {config.imu.max_gap_s:g} s, coasted", gaps),) if gaps else ()
+    notes = (LeftOut("imu", f"gap over {config.imu.max_gap_s:g} s, bridged or coasted", gaps),) if gaps else ()
     return FusionResult(states(recorder), join(Decisions, (early, applied, late)), initial.t_ns, notes)
 
 

@@ -55,6 +55,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         noise=noise,
         increments=vehicle.imu.samples == "increment",
         max_gap_ns=round(config.imu.max_gap_s * 1e9),
+        bridge_ns=round(config.imu.max_bridge_s * 1e9),
         coast_accel=config.imu.coast_accel,
         coast_rate=float(np.radians(config.imu.coast_rate_deg)),
         gate=(first, second, third),

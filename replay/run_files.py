@@ -50,13 +50,19 @@ class Manifest(TypedDict):
     facts: Facts
 
 
+class SeenAxis(TypedDict, total=False):
+    """Errors along an axis."""
+
+    rmse: float | None
+
+
 class SeenMethod(TypedDict, total=False):
     """A method's scores."""
 
     ar: float | None
-    lon: dict[str, Any] | None
-    lat: dict[str, Any] | None
-    yaw: dict[str, Any] | None
+    lon: SeenAxis | None
+    lat: SeenAxis | None
+    yaw: SeenAxis | None
 
 
 class SeenHidden(TypedDict):
@@ -74,6 +80,7 @@ class SeenMetrics(TypedDict, total=False):
     methods: dict[str, SeenMethod]
     hidden: SeenHidden
     distance_m: float
+    warnings: list[dict[str, str]]
 
 
 class SeenManifest(TypedDict, total=False):

@@ -17,7 +17,7 @@ def summary(runs: Sequence[RunColumns]) -> str:
     parts = [_extent(letter, run) for letter, run in named]
     if len(runs) == 2:
         parts.append(_differences(*runs))
-    parts += [_scores(runs), *(_hidden(run) for run in runs)]
+    parts += [_scores(runs), *(_hidden(run) for run in runs), *(_warnings(run) for run in runs)]
     parts.append(COLOURS + (" Run B: fused pink, all else darker." if len(runs) == 2 else ""))
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -66,6 +66,10 @@ def _hidden(run: RunColumns) -> str:
     end = hidden.get("end_horizontal_m") or {}
     quantiles = ", ".join(f"{key} {end[key]:.2f} m" for key in ("p50", "p95", "max") if end.get(key) is not None)
     return f"{run.name}: GNSS hidden {hidden['stretches']} x {hidden['length_s']:g} s; error at the end: {quantiles}"
+
+
+def _warnings(run: RunColumns) -> str:
+    return "\n\n".join(f"**{run.name}: {entry.get('text', '')}**" for entry in run.metrics.get("warnings", ()))
 
 
 def _differences(a: RunColumns, b: RunColumns) -> str:

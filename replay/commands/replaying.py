@@ -108,7 +108,10 @@ class Score:
             named_limits(self.limits) if self.limits is not None else load_config(self.folder / "config.toml").limits
         )
         metrics = score(run, limits)
-        write_json(self.folder / "metrics.json", metrics)
+        try:
+            write_json(self.folder / "metrics.json", metrics)
+        except OSError as error:
+            raise EgolocError(f"{self.folder / 'metrics.json'}: cannot be written: {error.strerror}") from None
         if self.json:
             print_json(metrics)
         else:
