@@ -58,10 +58,11 @@ def _jumped(t_ns: Nanoseconds, arrival_ns: Nanoseconds, keep: Mask) -> Mask:
     None where all arrivals are the same, or half of the rows would go: then the arrivals tell nothing.
     """
     offset = t_ns.astype(np.float64) - arrival_ns.astype(np.float64)  # int64 could overflow; 0.2 us do not matter
-    if not keep.any() or not np.ptp(arrival_ns[keep]):
-        return np.zeros(len(t_ns), bool)
+    nothing = np.zeros(len(t_ns), bool)
+    if not keep.any() or np.ptp(offset) <= JUMP_NS or not np.ptp(arrival_ns[keep]):
+        return nothing
     far: Mask = np.abs(offset - np.percentile(offset[keep], 50, method="lower")) > JUMP_NS
-    return far if 2 * int((far & keep).sum()) < int(keep.sum()) else np.zeros(len(t_ns), bool)
+    return far if 2 * int((far & keep).sum()) < int(keep.sum()) else nothing
 
 
 def _increasing(t_ns: Nanoseconds) -> NDArray[np.intp]:
@@ -91,11 +92,10 @@ def _increasing(t_ns: Nanoseconds) -> NDArray[np.intp]:
 def _apart(t_ns: Nanoseconds, keep: Mask) -> Mask:
     """(N,) rows outside the largest part that no long pause interrupts; the rows to keep have increasing stamps."""
     rows = np.flatnonzero(keep)
-    cuts = np.flatnonzero(np.diff(t_ns[rows].astype(np.float64)) >= APART_NS) + 1
     outside = np.zeros(len(t_ns), bool)
-    if len(cuts):
-        parts = np.split(rows, cuts)
-        largest = max(parts, key=len)
-        outside[rows] = True
-        outside[largest] = False
+    if not len(rows) or float(t_ns[rows[-1]]) - float(t_ns[rows[0]]) < APART_NS:
+        return outside
+    parts = np.split(rows, np.flatnonzero(np.diff(t_ns[rows]) >= APART_NS) + 1)
+    outside[rows] = True
+    outside[max(parts, key=len)] = False
     return outside

@@ -177,8 +177,8 @@ def _statistics(topics: Sequence[Messages], chunks: int, metadata: int) -> recor
         channel_message_counts=counts,
         chunk_count=chunks,
         message_count=sum(counts.values()),
-        message_end_time=max((int(topic.log_time.max()) for topic in topics), default=0),
-        message_start_time=min((int(topic.log_time.min()) for topic in topics), default=0),
+        message_end_time=max((int(topic.log_time.max()) for topic in topics if len(topic.log_time)), default=0),
+        message_start_time=min((int(topic.log_time.min()) for topic in topics if len(topic.log_time)), default=0),
         metadata_count=metadata,
         schema_count=len(topics),
     )

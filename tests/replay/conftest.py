@@ -11,6 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
+from sensors.records import Log
+from sensors.simulate.drive import simulate
+from sensors.simulate.scenarios import load
+from tests.replay.spoiling import Replayed
+
 T0_NS = 1_700_000_000_000_000_000
 SENSORS = ("gnss_position", "pose_fix", "non_holonomic")
 REASONS = ("accepted", "chi_square", "status")
@@ -147,3 +152,22 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
         return run
 
     return make
+
+
+@pytest.fixture(scope="session")
+def short_log() -> Log:
+    """A simulated minute, at rest for the first ten seconds, with every sensor and a reference."""
+    return simulate(60.0, 3, load("clean"))
+
+
+@pytest.fixture
+def at(tmp_path: Path) -> Callable[[str], Path]:
+    """The path of a log by its name."""
+    (tmp_path / "logs").mkdir()
+    return lambda name: tmp_path / "logs" / name
+
+
+@pytest.fixture
+def replayed(capsys: pytest.CaptureFixture[str]) -> Callable[..., Replayed]:
+    """A function that replays a log of `at` through the command line."""
+    return lambda path, *options: Replayed(path, capsys, *options)

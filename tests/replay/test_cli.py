@@ -214,7 +214,7 @@ class TestLogs:
     ) -> None:
         write_log(tmp_path / "log.mcap", replace(log, imu=None))
         assert main(["info", str(tmp_path / "log.mcap")]) == 0
-        assert "It cannot be replayed: expected IMU samples (sensor_msgs/msg/Imu), found none." in capsys.readouterr().out
+        assert "It cannot be replayed: expected IMU samples" in capsys.readouterr().out
         assert "no.mcap" in refused(capsys, "info", tmp_path / "no.mcap")
 
     def test_simulate_is_seeded_and_never_overwrites_unasked(
