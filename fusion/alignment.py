@@ -35,6 +35,8 @@ _LONGEST_BASELINE_S = 2.0
 """Positions further apart give no velocity, s."""
 _TOWN_ACCELERATION = 1.2
 """Horizontal acceleration of a car in town, each axis, RMS, m/s^2."""
+_STRAIGHT_RATE = 0.05
+"""Turning faster than this is a turn, rad/s."""
 _HEIGHT_SIGMA_M = 1000.0
 """Height where no GNSS gives it: anywhere on earth's surface."""
 
@@ -103,6 +105,8 @@ class Aligner:
         yaw, yaw_var = self._yaw(t_ns, sensor, row, m)
         if yaw is None:
             return None
+        if self._derived and sensor == Sensor.GNSS_POSITION and abs(window.gyro[2]) > _STRAIGHT_RATE:
+            return None  # a course over a baseline lags in a turn: wait for its end
         velocity = self._velocity(t_ns, window)
         if velocity is None:
             return None

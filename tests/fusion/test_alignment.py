@@ -162,3 +162,25 @@ def test_pose_fixes_that_see_too_little_do_not_start(drives: list[Drive]) -> Non
     result = run(vague, PROMPT)
     assert result.aligned_ns is None
     assert (result.decisions.reason == Reason.BEFORE_ALIGNMENT).all()
+
+
+def test_a_course_from_positions_waits_for_the_end_of_a_turn(drives: list[Drive]) -> None:
+    """Logs that begin in a turn, positions at 1 Hz alone: yaw within four sigmas, no start while turning hard."""
+    started = 0
+    for drive in drives:
+        imu = drive.log.imu
+        assert imu is not None
+        speed = np.linalg.norm(drive.truth.at(imu.t_ns).vel_enu, axis=1)
+        turning = np.flatnonzero((np.abs(imu.gyro[:, 2]) > 0.3) & (speed > 4.0) & (imu.t_ns - imu.t_ns[0] > 2e9))
+        if not len(turning):
+            continue
+        begin_s = (imu.t_ns[turning[0]] - imu.t_ns[0]) * 1e-9 - 1.0
+        log = without_yaw(only(later(drive.log, begin_s), "gnss"))
+        assert log.gnss is not None
+        result = run(replace(log, gnss=log.gnss[::10]), PROMPT)
+        if result.aligned_ns is None:
+            continue
+        started += 1
+        assert abs(imu.gyro[np.searchsorted(imu.t_ns, result.aligned_ns), 2]) < 0.3
+        assert abs(first_errors(result, drive)[8]) < 4.0
+    assert started > 5
