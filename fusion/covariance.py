@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
-from fusion.state import A_S, A_U, ACC_SIZE, ROW, Floats
+from fusion.state import A_PG, A_R, A_RR, A_S, A_U, A_VG, ACC_SIZE, ROW, Floats
 from sensors.kernel import kernel
 
 Scratch = tuple[Floats, Floats, Floats]
@@ -38,15 +38,15 @@ def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, dt: float) -> N
     for j in range(3):
         a0, a1, a2 = r[j] * dt, r[3 + j] * dt, r[6 + j] * dt
         # attitude error in mid-step per gyro bias is -m; velocity changes by dv x m
-        m: Vector = (acc[2, j] + 0.5 * a0, acc[3, j] + 0.5 * a1, acc[4, j] + 0.5 * a2)
+        m: Vector = (acc[A_R, j] + 0.5 * a0, acc[A_R + 1, j] + 0.5 * a1, acc[A_R + 2, j] + 0.5 * a2)
         g = cross(dv, m)
         for i in range(3):
-            acc[11 + i, j] += dt * (acc[8 + i, j] + 0.5 * g[i])
-            acc[8 + i, j] += g[i]
-            acc[5 + i, j] += dt * m[i]
-        acc[2, j] += a0
-        acc[3, j] += a1
-        acc[4, j] += a2
+            acc[A_PG + i, j] += dt * (acc[A_VG + i, j] + 0.5 * g[i])
+            acc[A_VG + i, j] += g[i]
+            acc[A_RR + i, j] += dt * m[i]
+        acc[A_R, j] += a0
+        acc[A_R + 1, j] += a1
+        acc[A_R + 2, j] += a2
         acc[A_U, j] += dt * (acc[A_S, j] + 0.5 * dv[j])
         acc[A_S, j] += dv[j]
     span[0] += dt
@@ -59,10 +59,10 @@ def transition(nav: Floats, earth: Floats, acc: Floats, span: float, phi: Floats
     for i in range(3):
         phi[i, 3 + i] += span
         for j in range(3):
-            phi[i, 9 + j] = acc[11 + i, j]
-            phi[i, 12 + j] = -acc[5 + i, j]
-            phi[3 + i, 9 + j] = acc[8 + i, j]
-            phi[3 + i, 12 + j] = phi[6 + i, 9 + j] = -acc[2 + i, j]
+            phi[i, 9 + j] = acc[A_PG + i, j]
+            phi[i, 12 + j] = -acc[A_RR + i, j]
+            phi[3 + i, 9 + j] = acc[A_VG + i, j]
+            phi[3 + i, 12 + j] = phi[6 + i, 9 + j] = -acc[A_R + i, j]
     _add_minus_skew(phi, 0, acc[A_U, 0], acc[A_U, 1], acc[A_U, 2])
     _add_minus_skew(phi, 3, acc[A_S, 0], acc[A_S, 1], acc[A_S, 2])
 

@@ -34,18 +34,18 @@ RING_SIZE = 2048
 ROW = 16
 """Rows of P, H and Phi are padded from 15 to 16 so that they fill vector registers; the last column stays zero."""
 
-# rows of Core.acc, each (., 3)
+# first rows of what Core.acc holds, each (3,) or (3, 3)
 A_S = 0
 """Integral of specific force, ENU m/s."""
 A_U = 1
 """Its integral, m."""
-A_R = slice(2, 5)
+A_R = 2
 """Integral of R_enu_body, s."""
-A_RR = slice(5, 8)
+A_RR = 5
 """Its integral, s^2."""
-A_VG = slice(8, 11)
+A_VG = 8
 """Velocity against gyro bias."""
-A_PG = slice(11, 14)
+A_PG = 11
 """Position against gyro bias."""
 ACC_SIZE = 14
 

@@ -24,13 +24,6 @@ def utc_from_gps(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return result
 
 
-def gps_from_utc(utc_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """GPS nanoseconds since 1980-01-06 of Unix UTC nanoseconds."""
-    utc = np.asarray(utc_ns, np.int64)
-    result: NDArray[np.int64] = utc - GPS_EPOCH_NS + np.searchsorted(_LEAPS_NS, utc, side="right") * NS_PER_S
-    return result
-
-
 def utc_from_gps_week(week: NDArray[np.int64], seconds_of_week: NDArray[np.float64]) -> NDArray[np.int64]:
     """Unix UTC nanoseconds of GPS week and seconds of week; rounded to a microsecond (a double holds no more)."""
     micros = np.rint(np.asarray(seconds_of_week, np.float64) * 1e6).astype(np.int64)

@@ -2,12 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from replay.commands.output import print_json, stage
 from sensors.errors import EgolocError
+
+if TYPE_CHECKING:  # records bring numpy along
+    from sensors.records import Log
 
 
 @dataclass(frozen=True)
@@ -29,9 +32,7 @@ class Convert:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Read, write, and say what was read."""
-        from replay.inventory import inventory, print_inventory
         from sensors.datasets import load
-        from sensors.mcap.io import write_log
 
         _check_new(self.log, overwrite=self.overwrite)
         if self.log.exists() and self.source.exists() and self.log.samefile(self.source):
@@ -42,13 +43,7 @@ class Convert:
                 from replay.harness import with_reference
 
                 log = with_reference(log, self.reference, log.map_frame)
-        with stage(f"writing {self.log}"):
-            write_log(self.log, log)
-        found = inventory(log, str(self.log))
-        if self.json:
-            print_json(found)
-        else:
-            print_inventory(found)
+        _write(log, self.log, as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -70,8 +65,6 @@ class Simulate:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Simulate, write, and say what was written."""
-        from replay.inventory import inventory, print_inventory
-        from sensors.mcap.io import write_log
         from sensors.simulate.drive import simulate
         from sensors.simulate.scenarios import load
 
@@ -81,13 +74,7 @@ class Simulate:
         seed = scenario.seed if self.seed is None else self.seed
         with stage(f"simulating {duration_s:g} s of driving"):
             log = simulate(duration_s, seed, scenario)
-        with stage(f"writing {self.log}"):
-            write_log(self.log, log)
-        found = inventory(log, str(self.log))
-        if self.json:
-            print_json(found)
-        else:
-            print_inventory(found)
+        _write(log, self.log, as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -113,6 +100,20 @@ class Info:
             print_json(found)
         else:
             print_inventory(found)
+
+
+def _write(log: "Log", path: Path, *, as_json: bool) -> None:
+    """Write a log and say what it holds."""
+    from replay.inventory import inventory, print_inventory
+    from sensors.mcap.io import write_log
+
+    with stage(f"writing {path}"):
+        write_log(path, log)
+    found = inventory(log, str(path))
+    if as_json:
+        print_json(found)
+    else:
+        print_inventory(found)
 
 
 def _check_new(path: Path, *, overwrite: bool) -> None:

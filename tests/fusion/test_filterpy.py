@@ -6,7 +6,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from fusion.config import Gates, GnssModel
+from fusion.config import Gates
 from fusion.covariance import propagate, transition
 from fusion.events import OUTPUT
 from fusion.gating import correct, innovate, whiten
@@ -19,6 +19,7 @@ from sensors.simulate.gnss import displaced
 from sensors.vehicle import ImuSpec, Vehicle
 from tests.fusion.free import (
     FREE,
+    HONEST,
     Floats,
     at_rest,
     core_at,
@@ -37,13 +38,7 @@ KNOWN_ATTITUDE = ImuSpec(gyro_noise_deg_per_sqrt_h=0.0, gyro_bias_instability_de
 CONFIG = msgspec.structs.replace(
     FREE,
     gates=Gates(use=False),
-    gnss=GnssModel(
-        inflation=1.0,
-        velocity_inflation=1.0,
-        sigma_floor_horizontal_m=0.0,
-        sigma_floor_vertical_m=0.0,
-        sigma_floor_velocity=0.0,
-    ),
+    gnss=HONEST.gnss,
 )
 POSITION_SIGMA, VELOCITY_SIGMA = 1e-4, 1e-4
 
