@@ -206,6 +206,24 @@ class Trajectory(_Columns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Tags(_Columns):
+    """What holds from each stamp on until the next: scene tags ("tunnel", or several, "canyon,night") or a drive mode.
+
+    text: (N,) strings; "" says nothing.
+    """
+
+    text: NDArray[np.str_]
+
+    def __post_init__(self) -> None:
+        self._set_time()
+        text = np.ascontiguousarray(self.text, dtype=np.str_)
+        if text.shape != self.t_ns.shape:
+            raise EgolocError(f"Tags.text: expected shape {self.t_ns.shape}, got {text.shape}")
+        text.flags.writeable = False
+        object.__setattr__(self, "text", text)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Log:
     """One drive: the columns of each sensor that it holds, and what is known of the vehicle and the map."""
 
@@ -218,3 +236,5 @@ class Log:
     vehicle: Vehicle = field(default_factory=Vehicle)
     map_frame: MapFrame | None = None
     left_out: Sequence[LeftOut] = ()
+    scene: Tags | None = None
+    mode: Tags | None = None

@@ -112,7 +112,7 @@ def sense(truth: Truth, duration_s: float, seed: int, config: DriveConfig) -> Dr
         wheel = simulate_wheel(truth, times(config.wheel.rate_hz), vehicle, config.wheel, stream(seed, "wheel"))
     if config.reference.use:
         trajectory = reference(truth, times(config.reference.rate_hz), frame, vehicle, config.reference)
-    log = Log(imu, fixes, velocities, pose_fixes, wheel, trajectory, vehicle, frame)
+    log = Log(imu, fixes, velocities, pose_fixes, wheel, trajectory, vehicle=vehicle, map_frame=frame)
     return Drive(log, truth, biases)
 
 
