@@ -3,10 +3,13 @@ PYTHON ?= python3
 BIN := .venv/bin
 ARGS ?=
 
-.PHONY: demo test test-all check bench picture clean
+.PHONY: demo road-test test test-all check bench picture clean
 
 demo: .venv/installed  ## ten simulated minutes of driving, replayed: the table
 	$(BIN)/egoloc demo $(ARGS)
+
+road-test: .venv/installed  ## 16,500 simulated kilometres; goes on where it was stopped
+	$(BIN)/egoloc replay scenario:road-test,drives=550 --out runs/road-test --states-hz 1 --decisions rejected --resume $(ARGS)
 
 test: .venv/installed-dev  ## the fast tests
 	$(BIN)/pytest $(ARGS)

@@ -11,9 +11,10 @@ from fusion._linalg import Vector, attitude, axpy, blend, matvec
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
-from fusion.measurements import body_velocity, gnss_position, gnss_velocity, pose_fix, wrap, yaw_row
+from fusion.measurements import gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
+from fusion.recovery import believed, doubted
 from fusion.result import Reason, Sensor
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, Core, Floats
 from sensors._kernels import radii
@@ -197,7 +198,14 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
         if kind == _POSE_FIX and dof < 3:
             accepted = _PARTLY
     k = _record(rec, e, kind, dof, _CHI_SQUARE)
-    _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
+    passed = _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
+    if kind in (_GNSS_POSITION, _POSE_FIX) and dof == 3:
+        if passed:
+            believed(core, int(kind == _POSE_FIX))
+        elif kind == _POSE_FIX:
+            doubted(core, par, 1, _triple(rec.innovation, k), heading(attitude(core.nav)), ev.t[e])
+        else:
+            doubted(core, par, 0, _triple(rec.innovation, k), (1.0, 0.0), ev.t[e])
 
 
 @kernel()
@@ -232,9 +240,7 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
         z = (wrap(m.yaw[row] - yaw_row(r, H, 0)), 0.0, 0.0)
     else:
         R[0, 0] = m.wheel_var[row]
-        z = (m.wheel[row] - body_velocity(nav, r, H, par.axle, rate)[0], 0.0, 0.0)
-        for j in range(15):
-            H[1, j] = H[2, j] = 0.0
+        z = (wheel_speed(nav, r, H, m.wheel[row], par.axle, rate), 0.0, 0.0)
     core.residual[0], core.residual[1], core.residual[2] = z
     return 3 if kind in (_GNSS_POSITION, _GNSS_VELOCITY) else 1
 
@@ -244,8 +250,7 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int
     """Pose fix in vehicle axes; directions that the histogram does not observe are dropped."""
     R, nav, cov = core.R, core.nav, m.pose_cov
     r = attitude(nav)
-    length = np.sqrt(r[0] * r[0] + r[3] * r[3])
-    c, s = r[0] / length, r[3] / length
+    c, s = heading(r)
     tilt = (m.pose_tilt[row, 0], m.pose_tilt[row, 1])
     z = pose_fix(r, core.H, nav, _triple(m.pose_llh, row), m.pose_yaw[row], tilt, par.pose_arm, (c, s))
     core.residual[0], core.residual[1], core.residual[2] = z
@@ -266,15 +271,15 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int
 
 
 @kernel(inline="always")
-def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accepted: int) -> None:
-    """Gate the core's residual and correct the state; complete decision k."""
+def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accepted: int) -> bool:
+    """Gate the core's residual and correct the state; complete decision k. Whether it passed."""
     L, residual = core.L, core.residual
     rec.scores[k, 1] = threshold
     rec.scores[k, 2] = rec.scores[k, 3] = 0.0
     for i in range(dof):
         rec.innovation[k, i] = residual[i]
     if not innovate(core.P, core.H, core.W, dof, core.R, L):
-        return
+        return False
     for i in range(dof):
         total = 0.0
         for j in range(i + 1):
@@ -283,12 +288,13 @@ def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accept
     score = whiten(dof, residual, L)
     rec.scores[k, 0] = score
     if not score <= threshold:
-        return
-    correct(core.nav, core.earth, core.P, core.W, core.dx, residual)
+        return False
+    correct(core.nav, core.earth, core.P, core.W, core.dx, residual, dof)
     dx = core.dx
     rec.reason[k] = accepted
     rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
     rec.scores[k, 3] = abs(dx[8])
+    return True
 
 
 @kernel(inline="always")
@@ -297,6 +303,10 @@ def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> in
     k = int(rec.filled[1])
     rec.filled[1] = k + 1
     rec.event[k], rec.sensor[k], rec.dof[k], rec.reason[k] = event, sensor, dof, reason
+    for i in range(3):
+        rec.innovation[k, i] = rec.sigma[k, i] = np.nan
+    for i in range(4):
+        rec.scores[k, i] = np.nan
     return k
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.baselines import Fix, enu_between, moved, over_best_baseline
 from fusion.config import FusionConfig
 from fusion.events import Measurements, Parameters
 from fusion.result import Sensor
@@ -16,6 +17,7 @@ from fusion.state import (
     E_GYRO_BIAS,
     E_POSITION,
     E_VELOCITY,
+    E_WHEEL_SCALE,
     ERROR_SIZE,
     GYRO_BIAS,
     LLH,
@@ -25,39 +27,31 @@ from fusion.state import (
     Floats,
 )
 from sensors._kernels import EARTH_RATE, gravity_enu
-from sensors.geodesy import meridian_radius, transverse_radius
 from sensors.rotation import matrix_from_q, q_from_rpy
 from sensors.vehicle import ImuSpec, Vehicle
 
 _DEG_PER_H = math.pi / 180.0 / 3600.0
 _MG = 9.80665e-3
-_LONGEST_BASELINE_S = 2.0
-"""Positions further apart give no velocity, s."""
 _TOWN_ACCELERATION = 1.2
 """Horizontal acceleration of a car in town, each axis, RMS, m/s^2."""
 _STRAIGHT_RATE = 0.05
 """Turning faster than this is a turn, rad/s."""
+_PATIENCE_NS = 1_000_000_000
+"""A pose fix that is contradicted is believed after so long."""
+_FEWEST = 10
+"""IMU samples in a window, at least."""
 _HEIGHT_SIGMA_M = 1000.0
 """Height where no GNSS gives it: anywhere on earth's surface."""
 
 
 @dataclass(frozen=True)
 class Initial:
-    """First state: t_ns, nav (16,), P (15, 15) and the sensor whose measurement completed it."""
+    """First state: t_ns, nav (17,), P (16, 16) and the sensor whose measurement completed it."""
 
     t_ns: int
     nav: Floats
     P: Floats
     sensor: Sensor
-
-
-@dataclass(frozen=True)
-class _Fix:
-    """Latest measurement of a kind: t_ns, value, covariance."""
-
-    t_ns: int
-    value: Floats
-    cov: Floats
 
 
 @dataclass
@@ -77,12 +71,16 @@ class Aligner:
     vehicle: Vehicle
     config: FusionConfig
     par: Parameters
-    positions: deque[_Fix] = field(default_factory=lambda: deque(maxlen=64))
-    velocities: deque[_Fix] = field(default_factory=lambda: deque(maxlen=64))
-    poses: deque[_Fix] = field(default_factory=lambda: deque(maxlen=64))
+    first_imu_ns: int = 0
+    """The IMU's first sample."""
+    positions: deque[Fix] = field(default_factory=lambda: deque(maxlen=64))
+    velocities: deque[Fix] = field(default_factory=lambda: deque(maxlen=64))
+    poses: deque[Fix] = field(default_factory=lambda: deque(maxlen=64))
     rest: tuple[Floats, int] | None = None
     """Sum of mean rates over windows at rest and their number."""
     rest_until_ns: int = 0
+    doubted_ns: int = 2**62
+    """When a pose fix could first have been the first state."""
     _derived: bool = False
     """Velocities are differences of positions."""
 
@@ -92,13 +90,13 @@ class Aligner:
         """Take one measurement and the IMU samples (t, gyro, accel) up to its time; a state once it can be had."""
         window = self._window(t_ns, imu)
         if sensor == Sensor.GNSS_POSITION:
-            self._take_position(_Fix(t_ns, m.gnss_llh[row], m.gnss_cov[row]))
+            self._take_position(Fix(t_ns, m.gnss_llh[row], m.gnss_cov[row]))
         elif sensor == Sensor.GNSS_VELOCITY:
             self._derived = False
-            self.velocities.append(_Fix(t_ns, m.vel[row], m.vel_cov[row]))
+            self.velocities.append(Fix(t_ns, m.vel[row], m.vel_cov[row]))
         elif sensor == Sensor.POSE_FIX:
             value = np.append(m.pose_llh[row], m.pose_yaw[row])
-            self.poses.append(_Fix(t_ns, value, m.pose_cov[row]))
+            self.poses.append(Fix(t_ns, value, m.pose_cov[row]))
         if window is None:
             return None
         self._watch_rest(t_ns, window)
@@ -108,26 +106,30 @@ class Aligner:
         if self._derived and sensor == Sensor.GNSS_POSITION and abs(window.gyro[2]) > _STRAIGHT_RATE:
             return None  # a course over a baseline lags in a turn: wait for its end
         velocity = self._velocity(t_ns, window)
-        if velocity is None:
+        if velocity is None or (sensor == Sensor.POSE_FIX and not self._confirmed(t_ns, velocity[0])):
             return None
         return self._build(t_ns, Sensor(sensor), yaw, yaw_var, velocity, window)
 
-    def _take_position(self, fix: _Fix) -> None:
+    def _take_position(self, fix: Fix) -> None:
         """Keep a position, and where the receiver gives no velocity the one over the last positions."""
         self.positions.append(fix)
         if self.velocities and not self._derived and fix.t_ns - self.velocities[-1].t_ns <= 1e9:
             return
-        best = _over_best_baseline(self.positions)
+        best = over_best_baseline(self.positions)
         if best is not None:
             self._derived = True
             self.velocities.append(best)
 
     def _window(self, t_ns: int, imu: tuple[NDArray[np.int64], Floats, Floats]) -> _Window | None:
-        """Averages over (t - window, t]; None where the IMU does not cover it."""
+        """Averages over (t - window, t]; None where the IMU does not cover it. Less will do when it has just begun."""
         t, gyro, accel = imu
         length = round(self.config.alignment.window_s * 1e9)
         first, last = np.searchsorted(t, (t_ns - length, t_ns), side="right")
-        if last - first < 10 or t[last - 1] - t[first] < 0.8 * length:
+        if last - first < _FEWEST:
+            return None
+        begun_ns = t_ns - self.first_imu_ns
+        shortest = round(self.config.alignment.first_window_s * 1e9) if begun_ns < length else 0.8 * length
+        if t[last - 1] - t[first] < min(shortest, 0.8 * length):
             return None
         if np.diff(t[first:last]).max() > self.par.max_gap_ns:
             return None
@@ -137,7 +139,9 @@ class Aligner:
         seen = [v for v in (*self.velocities, *self._pose_velocity()) if t_ns - v.t_ns <= 1e9]
         # steady driving is as quiet as rest: something must have seen that the vehicle is slow
         slow = all(np.linalg.norm(v.value[:2]) < 0.3 + 2.0 * math.sqrt(v.cov[0, 0] + v.cov[1, 1]) for v in seen)
-        return _Window(g.mean(axis=0), f.mean(axis=0), quiet and slow and bool(seen), (t[last - 1] - t[first]) * 1e-9)
+        # and over a shorter time braking is quiet, too
+        still = quiet and slow and bool(seen) and t[last - 1] - t[first] >= 0.8 * length
+        return _Window(g.mean(axis=0), f.mean(axis=0), still, (t[last - 1] - t[first]) * 1e-9)
 
     def _watch_rest(self, t_ns: int, window: _Window) -> None:
         """Average the rates of windows at rest that do not overlap."""
@@ -160,7 +164,25 @@ class Aligner:
             return self._course(self.velocities[-1])
         return None, 0.0
 
-    def _course(self, velocity: _Fix) -> tuple[float | None, float]:
+    def _confirmed(self, t_ns: int, velocity: Floats) -> bool:
+        """Whether GNSS, or else the fix before it, confirms the last pose fix: one alone may be far off.
+
+        Where they go on to differ the fix is believed after a while.
+        """
+        self.doubted_ns = min(self.doubted_ns, t_ns)
+        fix, place = self.poses[-1], self.positions[-1] if self.positions else None
+        if place is not None and t_ns - place.t_ns <= 0.5e9:
+            level = matrix_from_q(q_from_rpy(0.0, 0.0, float(fix.value[3]))[0])
+            arm = level @ (np.array(self.vehicle.pose_lever_arm) - np.array(self.vehicle.gnss_lever_arm))
+        elif len(self.poses) > 1:
+            place, arm = self.poses[-2], np.zeros(3)
+        else:
+            return True
+        gone = enu_between(place.value, fix.value) - arm - velocity * (t_ns - place.t_ns) * 1e-9
+        apart = gone[:2] @ np.linalg.solve((place.cov + fix.cov)[:2, :2], gone[:2])
+        return bool(apart <= self.par.gate[1]) or t_ns - self.doubted_ns > _PATIENCE_NS
+
+    def _course(self, velocity: Fix) -> tuple[float | None, float]:
         """Direction of motion and its variance, where it is fast enough and known well enough."""
         limits = self.config.alignment
         east, north = velocity.value[:2]
@@ -173,15 +195,15 @@ class Aligner:
             return None, 0.0
         return math.atan2(north, east), variance + math.radians(limits.course_sigma_deg) ** 2
 
-    def _pose_velocity(self) -> list[_Fix]:
+    def _pose_velocity(self) -> list[Fix]:
         """Velocity over the last pose fixes (level): none or one."""
-        best = _over_best_baseline(self.poses)
+        best = over_best_baseline(self.poses)
         if best is None:
             return []
         cov = best.cov.copy()
         cov[2], cov[:, 2] = 0.0, 0.0
         cov[2, 2] = 0.3**2
-        return [_Fix(best.t_ns, best.value * (1.0, 1.0, 0.0), cov)]
+        return [Fix(best.t_ns, best.value * (1.0, 1.0, 0.0), cov)]
 
     def _velocity(self, t_ns: int, window: _Window) -> tuple[Floats, Floats] | None:
         """ENU velocity and covariance: GNSS or pose fixes within 0.5 s, else rest."""
@@ -211,7 +233,7 @@ class Aligner:
         q = q_from_rpy(rpy[0], rpy[1], yaw)[0]
         R = matrix_from_q(q)
         nav = np.zeros(NAV_SIZE)
-        nav[LLH] = _moved(llh, -(R @ np.array(arm)))
+        nav[LLH] = moved(llh, -(R @ np.array(arm)))
         nav[VELOCITY], nav[QUATERNION] = velocity[0], q
         bias, bias_sigma = self._gyro_bias(R, float(llh[0]))
         nav[GYRO_BIAS] = bias
@@ -220,6 +242,7 @@ class Aligner:
         P[E_VELOCITY, E_VELOCITY] = velocity[1] + np.eye(3) * (np.linalg.norm(window.gyro) * np.linalg.norm(arm)) ** 2
         P[E_ATTITUDE, E_ATTITUDE] = np.diag([level_sigma**2, level_sigma**2, yaw_var])
         P[E_GYRO_BIAS, E_GYRO_BIAS] = np.eye(3) * bias_sigma**2
+        P[E_WHEEL_SCALE, E_WHEEL_SCALE] = self.config.motion.wheel_scale_sigma**2
         P[E_ACCEL_BIAS, E_ACCEL_BIAS] = np.eye(3) * _accel_bias_sigma(self.vehicle.imu) ** 2
         return Initial(t_ns, nav, P, sensor)
 
@@ -238,7 +261,7 @@ class Aligner:
             return None
         age = (t_ns - fix.t_ns) * 1e-9
         cov = fix.cov + np.eye(3) * (1.0 * age) ** 2
-        return _moved(fix.value, velocity * age), cov, np.array(self.vehicle.gnss_lever_arm)
+        return moved(fix.value, velocity * age), cov, np.array(self.vehicle.gnss_lever_arm)
 
     def _level(self, t_ns: int, lat: float, height: float, yaw: float, window: _Window) -> tuple[Floats, float]:
         """Roll and pitch that turn the mean specific force into acceleration minus gravity, and their sigma, rad.
@@ -284,41 +307,3 @@ class Aligner:
 
 def _accel_bias_sigma(spec: ImuSpec) -> float:
     return (spec.accel_turn_on_bias_mg + spec.accel_bias_instability_mg) * _MG
-
-
-def _over_best_baseline(fixes: deque[_Fix]) -> _Fix | None:
-    """Velocity from an older fix to the last one.
-
-    A short baseline shows the fixes' noise, a long one the acceleration in between (1 m/s^2): the smaller sum wins.
-    """
-    best: _Fix | None = None
-    for older in fixes:
-        dt = (fixes[-1].t_ns - older.t_ns) * 1e-9
-        if 0.0 < dt <= _LONGEST_BASELINE_S:
-            cov = (fixes[-1].cov + older.cov) / dt**2 + np.eye(3) * (0.5 * dt) ** 2
-            if best is None or cov[0, 0] < best.cov[0, 0]:
-                best = _Fix(fixes[-1].t_ns, _enu_between(older.value, fixes[-1].value) / dt, cov)
-    return best
-
-
-def _enu_between(a: Floats, b: Floats) -> Floats:
-    """ENU metres from a to b, two llh nearby."""
-    return np.array(
-        [
-            (b[1] - a[1]) * (float(transverse_radius(a[0])) + a[2]) * math.cos(a[0]),
-            (b[0] - a[0]) * (float(meridian_radius(a[0])) + a[2]),
-            b[2] - a[2],
-        ]
-    )
-
-
-def _moved(llh: Floats, enu: Floats) -> Floats:
-    """llh moved by a few ENU metres."""
-    lat, lon, h = llh
-    return np.array(
-        [
-            lat + enu[1] / (float(meridian_radius(lat)) + h),
-            lon + enu[0] / ((float(transverse_radius(lat)) + h) * math.cos(lat)),
-            h + enu[2],
-        ]
-    )

@@ -12,6 +12,7 @@ _NOT_ZERO = {
     "output_hz",
     "rate_hz",
     "window_s",
+    "first_window_s",
     "still_window_s",
     "max_gap_s",
     "max_sigma_longitudinal_m",
@@ -110,6 +111,10 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Turn rate at rest, besides the gyro's noise, deg/s."""
     wheel: bool = True
     """Apply wheel speeds."""
+    wheel_scale_sigma: NonNegative = 0.01
+    """Scale error of the wheel speed before anything is known of it (tyre radius); it is estimated, -."""
+    wheel_scale_walk: NonNegative = 0.001
+    """Random walk of that scale error (tyres warm up, loads change), 1/sqrt(h)."""
 
 
 class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -119,6 +124,8 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Probability that a correct measurement passes, -."""
     use: bool = True
     """Gate at all."""
+    outvoted: Annotated[int, msgspec.Meta(ge=1)] = 20
+    """So many GNSS positions and pose fixes, rejected in a row while they agree, outvote the state, -."""
 
 
 class Alignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -126,6 +133,8 @@ class Alignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     window_s: Positive = 1.0
     """IMU window that is averaged for levelling, s."""
+    first_window_s: Positive = 0.08
+    """While the IMU has not run for a whole window yet, so much of it will do (ten samples at least), s."""
     min_course_speed: NonNegative = 3.0
     """GNSS course becomes yaw above this speed, m/s."""
     max_course_sigma_deg: Positive = 10.0

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
-from fusion.state import A_PG, A_R, A_RR, A_S, A_U, A_VG, ACC_SIZE, ROW, Floats
+from fusion.state import A_PG, A_R, A_RR, A_S, A_U, A_VG, ACC_SIZE, E_WHEEL_SCALE, ERROR_SIZE, ROW, Floats
 from sensors.kernel import kernel
 
 Scratch = tuple[Floats, Floats, Floats]
-"""phi (9, 16), M (9, 16) and Mt (15, 16) of the core."""
+"""phi (9, 16), M (9, 16) and Mt (16, 16) of the core."""
 
 
 class Noise(NamedTuple):
@@ -27,6 +27,8 @@ class Noise(NamedTuple):
     gyro_bias_var: float
     accel_bias_var: float
     bias_rate: float
+    wheel_scale_rate: float
+    """Growth of the wheel scale's variance, 1/s."""
 
 
 @kernel()
@@ -80,11 +82,11 @@ def _add_minus_skew(phi: Floats, row: int, x: float, y: float, z: float) -> None
 
 @kernel(fastmath={"contract"})
 def _product(phi: Floats, X: Floats, Y: Floats) -> None:
-    """Y (9, 16) = phi (9, 16) X (15, 16). The sum stands inside: the compiler keeps it in vector registers."""
+    """Y (9, 16) = phi (9, 16) X (16, 16). The sum stands inside: the compiler keeps it in vector registers."""
     for i in range(9):
         for j in range(ROW):
             total = 0.0
-            for k in range(15):
+            for k in range(15):  # the wheel scale moves nothing
                 total += phi[i, k] * X[k, j]
             Y[i, j] = total
 
@@ -104,7 +106,7 @@ def propagate(
         for i in range(9):
             Mt[k, i] = M[i, k]
     for i in range(9):
-        for j in range(9, 15):
+        for j in range(9, ERROR_SIZE):
             P[i, j] = P[j, i] = M[i, j]
     _product(phi, Mt, M)
     for i in range(9):
@@ -129,6 +131,7 @@ def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float) -> None:
         P[6 + i, 6 + i] += qg
         P[9 + i, 9 + i] += noise.gyro_bias_var * drift
         P[12 + i, 12 + i] += noise.accel_bias_var * drift
+    P[E_WHEEL_SCALE, E_WHEEL_SCALE] += noise.wheel_scale_rate * span
     # velocity against attitude: -[s]x qg / 2
     half = 0.5 * qg
     x, y, z = half * acc[A_S, 0], half * acc[A_S, 1], half * acc[A_S, 2]
@@ -146,10 +149,10 @@ def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float) -> None:
 @kernel()
 def coast(P: Floats, seconds: float, accel: float, rate: float) -> None:
     """Propagate P over a gap in the IMU at constant velocity, and widen it."""
-    for i in range(15):
+    for i in range(ERROR_SIZE):
         for k in range(3):
             P[k, i] += seconds * P[3 + k, i]
-    for i in range(15):
+    for i in range(ERROR_SIZE):
         for k in range(3):
             P[i, k] += seconds * P[i, 3 + k]
     widen(P, seconds, accel, rate)

@@ -26,6 +26,8 @@ class Parameters(NamedTuple):
     coast_rate: float
     gate: Vector
     """Chi-square thresholds for 1, 2 and 3 degrees of freedom."""
+    outvoted: int
+    """So many agreeing rejections of GNSS positions and pose fixes outvote the state."""
     gnss_arm: Vector
     pose_arm: Vector
     axle: Vector
@@ -80,8 +82,9 @@ class Events(NamedTuple):
 class Recorder(NamedTuple):
     """Output arrays, filled from ``filled`` = (states, decisions) on.
 
-    States: t (N,), nav (N, 16), pose_cov (N, 6, 6), sigma_state (N, 15). Decisions: event (M,) index of the event;
-    sensor, reason, dof (M,) int8; innovation, sigma (M, 3); scores (M, 4): NIS, threshold, metres moved, yaw moved.
+    States: t (N,), nav (N, 16) and sigma_state (N, 15) without the wheel scale, pose_cov (N, 6, 6). Decisions: event
+    (M,) index of the event; sensor, reason, dof (M,) int8; innovation, sigma (M, 3); scores (M, 4): NIS, threshold,
+    metres moved, yaw moved.
     """
 
     filled: NDArray[np.int64]
@@ -110,7 +113,7 @@ def new_recorder(states: int, decided: int) -> Recorder:
         sensor=np.zeros(decided, np.int8),
         reason=np.zeros(decided, np.int8),
         dof=np.zeros(decided, np.int8),
-        innovation=np.full((decided, 3), np.nan),
-        sigma=np.full((decided, 3), np.nan),
-        scores=np.full((decided, 4), np.nan),
+        innovation=np.empty((decided, 3)),
+        sigma=np.empty((decided, 3)),
+        scores=np.empty((decided, 4)),
     )

@@ -4,7 +4,18 @@ import math
 
 from fusion._linalg import Quaternion, Vector, exp_q, multiply, normalize
 from fusion.mechanization import refresh
-from fusion.state import G_COS, G_HEIGHT, G_MERIDIAN, G_SIN, G_TRANSVERSE, ROW, Floats
+from fusion.state import (
+    E_WHEEL_SCALE,
+    ERROR_SIZE,
+    G_COS,
+    G_HEIGHT,
+    G_MERIDIAN,
+    G_SIN,
+    G_TRANSVERSE,
+    ROW,
+    WHEEL_SCALE,
+    Floats,
+)
 from sensors.kernel import kernel
 
 FAR_M = 10.0
@@ -82,20 +93,20 @@ def diagonalize(eigen: Floats) -> None:
 
 @kernel(fastmath={"contract"})
 def innovate(P: Floats, H: Floats, W: Floats, dof: int, R: Floats, L: Floats) -> bool:
-    """W (3, 16) = L^-1 H P with L L' = S = H P H' + R, the lower Cholesky factor; rows of H from dof on are zero.
+    """The first dof rows of W (3, 16) = L^-1 H P with L L' = S = H P H' + R, the lower Cholesky factor.
 
     False if S is not positive definite.
     """
-    for i in range(3):
+    for i in range(dof):
         for j in range(ROW):
             total = 0.0
-            for k in range(15):
+            for k in range(ERROR_SIZE):
                 total += H[i, k] * P[k, j]
             W[i, j] = total
     for i in range(dof):
         for j in range(i + 1):
             total = R[i, j]
-            for k in range(15):
+            for k in range(ERROR_SIZE):
                 total += W[i, k] * H[j, k]
             for k in range(j):
                 total -= L[i, k] * L[j, k]
@@ -130,25 +141,41 @@ def whiten(dof: int, residual: Floats, L: Floats) -> float:
 
 
 @kernel(fastmath={"contract"})
-def correct(nav: Floats, earth: Floats, P: Floats, W: Floats, dx: Floats, white: Floats) -> None:
+def shrink(P: Floats, W: Floats, dof: int) -> None:
+    """P -= W' W over the first dof rows of W: one loop for each number of rows."""
+    for i in range(ERROR_SIZE):
+        a, b, c = W[0, i], W[1, i], W[2, i]
+        if dof == 1:
+            for j in range(ROW):
+                P[i, j] -= a * W[0, j]
+        elif dof == 2:
+            for j in range(ROW):
+                P[i, j] -= a * W[0, j] + b * W[1, j]
+        else:
+            for j in range(ROW):
+                P[i, j] -= a * W[0, j] + b * W[1, j] + c * W[2, j]
+
+
+@kernel(fastmath={"contract"})
+def correct(nav: Floats, earth: Floats, P: Floats, W: Floats, dx: Floats, white: Floats, dof: int) -> None:
     """Kalman update after ``innovate`` and ``whiten``: dx = W' w, P -= W' W, then the error is moved into nav.
 
     Resetting the attitude error turns its axes: P is mapped by G = I + [dtheta]x / 2, the left Jacobian of SO(3) to
     first order (Sola 2017, sec. 6.3 and 7.3, for a global error).
     """
     for j in range(ROW):
-        dx[j] = white[0] * W[0, j] + white[1] * W[1, j] + white[2] * W[2, j]
-    for i in range(15):
-        a, b, c = W[0, i], W[1, i], W[2, i]
+        dx[j] = white[0] * W[0, j]
+    for i in range(1, dof):
         for j in range(ROW):
-            P[i, j] -= a * W[0, j] + b * W[1, j] + c * W[2, j]
+            dx[j] += white[i] * W[i, j]
+    shrink(P, W, dof)
     inject(nav, earth, dx)
     reset(P, (0.5 * dx[6], 0.5 * dx[7], 0.5 * dx[8]))
 
 
 @kernel()
 def inject(nav: Floats, earth: Floats, dx: Floats) -> None:
-    """Add the error dx (15,) to nav (16,): metres to radians at the state's place, attitude on the left."""
+    """Add the error dx (16,) to nav (17,): metres to radians at the state's place, attitude on the left."""
     climb = nav[2] - earth[G_HEIGHT]
     m = earth[G_MERIDIAN] * (1.0 - climb * earth[G_MERIDIAN])
     n = earth[G_TRANSVERSE] * (1.0 - climb * earth[G_TRANSVERSE])
@@ -164,6 +191,7 @@ def inject(nav: Floats, earth: Floats, dx: Floats) -> None:
         nav[3 + i] += dx[3 + i]
         nav[10 + i] += dx[9 + i]
         nav[13 + i] += dx[12 + i]
+    nav[WHEEL_SCALE] += dx[E_WHEEL_SCALE]
     q: Quaternion = (nav[6], nav[7], nav[8], nav[9])
     turn = exp_q((dx[6], dx[7], dx[8]))
     nav[6], nav[7], nav[8], nav[9] = normalize(multiply(turn, q))
@@ -177,7 +205,7 @@ def reset(P: Floats, half: Vector) -> None:
         P[6, j] = a + (half[1] * c - half[2] * b)
         P[7, j] = b + (half[2] * a - half[0] * c)
         P[8, j] = c + (half[0] * b - half[1] * a)
-    for j in range(15):
+    for j in range(ERROR_SIZE):
         a, b, c = P[j, 6], P[j, 7], P[j, 8]
         P[j, 6] = a + (half[1] * c - half[2] * b)
         P[j, 7] = b + (half[2] * a - half[0] * c)

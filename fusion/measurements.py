@@ -1,4 +1,4 @@
-"""Measurement models: residual and Jacobian of each sensor, written into H (3, 15); residuals are returned.
+"""Measurement models: residual and Jacobian of each sensor, written into H (3, 16); residuals are returned.
 
 Each function gives measured minus predicted (three numbers) and fills the rows of H that it uses; columns that a sensor
 does not see stay zero. Attitude error is on the left in ENU, so ``d(R l) = -[R l]x dtheta``; a gyro bias error lowers
@@ -8,7 +8,7 @@ the true rate, so ``d(omega) = -dbg``.
 import math
 
 from fusion._linalg import Matrix, Vector, cross, matvec, matvec_t
-from fusion.state import Floats
+from fusion.state import E_WHEEL_SCALE, WHEEL_SCALE, Floats
 from sensors._kernels import EARTH_RATE, radii
 from sensors.kernel import kernel
 
@@ -81,6 +81,13 @@ def yaw_row(r: Matrix, H: Floats, row: int) -> float:
 
 
 @kernel()
+def heading(r: Matrix) -> Pair:
+    """Cosine and sine of the body's yaw."""
+    length = math.sqrt(r[0] * r[0] + r[3] * r[3])
+    return r[0] / length, r[3] / length
+
+
+@kernel()
 def wrap(angle: float) -> float:
     """Angle in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
@@ -88,9 +95,9 @@ def wrap(angle: float) -> float:
 
 @kernel()
 def pose_fix(
-    r: Matrix, H: Floats, nav: Floats, llh: Vector, yaw: float, tilt: Pair, arm: Vector, heading: Pair
+    r: Matrix, H: Floats, nav: Floats, llh: Vector, yaw: float, tilt: Pair, arm: Vector, ahead: Pair
 ) -> Vector:
-    """EgoVM's (x, y, yaw), along and left of the heading (cos, sin) and yaw: m, m, rad.
+    """EgoVM's (x, y, yaw), along and left of the direction ahead (cos, sin) and yaw: m, m, rad.
 
     llh (3,): the fix on the map's ground surface; tilt (2,): horizontal metres per metre of height between the local
     vertical and the map's, so that height does not leak into x and y.
@@ -100,7 +107,7 @@ def pose_fix(
     east, north, up = point[0] + lever[0], point[1] + lever[1], point[2] + lever[2]
     east += tilt[0] * up
     north += tilt[1] * up
-    c, s = heading[0], heading[1]
+    c, s = ahead
     for row, (a, b) in ((0, (c, s)), (1, (-s, c))):
         direction: Vector = (a, b, a * tilt[0] + b * tilt[1])
         H[row, 0], H[row, 1], H[row, 2] = direction
@@ -124,3 +131,15 @@ def body_velocity(nav: Floats, r: Matrix, H: Floats, arm: Vector, rate: Vector) 
         H[i, 6], H[i, 7], H[i, 8] = cross(axis, v)  # a' [v]x = (a x v)'
     _minus_skew(H, 0, 9, (-arm[0], -arm[1], -arm[2]))
     return in_body[0] + swing[0], in_body[1] + swing[1], in_body[2] + swing[2]
+
+
+@kernel()
+def wheel_speed(nav: Floats, r: Matrix, H: Floats, speed: float, axle: Vector, rate: Vector) -> float:
+    """Forward velocity of the rear axle times one plus the wheel's scale error, m/s."""
+    ahead: float = body_velocity(nav, r, H, axle, rate)[0]
+    times = 1.0 + nav[WHEEL_SCALE]
+    for j in range(E_WHEEL_SCALE):
+        H[0, j] *= times
+        H[1, j] = H[2, j] = 0.0
+    H[0, E_WHEEL_SCALE] = ahead
+    return float(speed - times * ahead)

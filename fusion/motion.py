@@ -126,4 +126,4 @@ def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
         R[i, i] = par.zero_rate_var
         residual[i] = mean[i] - earth[i] - nav[10 + i]
     if innovate(core.P, core.H, core.W, 3, R, core.L) and whiten(3, residual, core.L) <= par.gate[2]:
-        correct(nav, core.earth, core.P, core.W, core.dx, residual)
+        correct(nav, core.earth, core.P, core.W, core.dx, residual, 3)

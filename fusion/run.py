@@ -1,179 +1,98 @@
-"""Batch run over a log: lay out the events, align, let the kernel go through them once."""
-
-from collections.abc import Sequence
-from typing import TypeVar
+"""Fusing a drive: a Session takes it in pieces, ``run`` in one."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion._kernels import process
-from fusion.alignment import Aligner, Initial
 from fusion.config import FusionConfig
-from fusion.events import OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
-from fusion.mechanization import refresh
+from fusion.navigator import Navigator
+from fusion.recording import join
 from fusion.result import Decisions, FusionResult, Reason, States
-from fusion.state import (
-    ACCEL_BIAS,
-    C_INTERVAL,
-    C_SAMPLE,
-    C_STATE,
-    C_TICK,
-    GYRO_BIAS,
-    LLH,
-    QUATERNION,
-    VELOCITY,
-    Core,
-    Floats,
-    covariance,
-    new_core,
-)
-from fusion.timeline import APPLY, Sources, Timeline, merge, parameters, sources
+from fusion.sources import RECORDS
+from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
-from sensors.records import Imu, LeftOut, Log
+from sensors.geodesy import MapFrame
+from sensors.records import LeftOut, Log
+from sensors.vehicle import Vehicle
 
-Columns = TypeVar("Columns", States, Decisions)
-Scalar = TypeVar("Scalar", np.int64, np.float64)
+_START_NS = 60 * NS_PER_S
+"""Measurements older than this cannot help an IMU that has not begun yet."""
+
+
+class Session:
+    """A drive in stamp order, piece by piece (``sensors.pieces``): the same bits however it is cut.
+
+    Results follow the pieces: the IMU is held back by the largest delay of the vehicle's GNSS, whose measurements are
+    true before their stamps. A measurement that a piece brings after the state has passed it is LATE. What waits in
+    memory is the last piece, and measurements since the last IMU sample.
+    """
+
+    def __init__(self, vehicle: Vehicle, map_frame: MapFrame | None = None, config: FusionConfig | None = None) -> None:
+        self._config = config or FusionConfig()
+        self._navigator = Navigator(vehicle, map_frame, self._config)
+        self._held_ns = max(0, *(round(s * 1e9) for s in (vehicle.gnss_delay_s, vehicle.gnss_velocity_delay_s)))
+        self._samples = 0
+
+    def push(self, piece: Log) -> FusionResult:
+        """Take the next piece; returns what was decided by now.
+
+        Raises EgolocError for pose fixes without a map frame and for IMU stamps that do not rise.
+        """
+        navigator = self._navigator
+        before = navigator.last_imu_ns if self._samples else None
+        navigator.add(piece)
+        self._samples += 0 if piece.imu is None else len(piece.imu)
+        if not self._samples:
+            navigator.decide(Reason.BEFORE_ALIGNMENT, _last_stamp(piece) - _START_NS)
+        else:
+            navigator.advance(navigator.last_imu_ns - self._held_ns)
+        return self._result(self._gaps(piece, before))
+
+    def finish(self) -> FusionResult:
+        """The rest of the drive. Raises EgolocError if it had no IMU."""
+        if self._samples < 2:
+            raise EgolocError("the log has no IMU samples: expected sensor_msgs/msg/Imu on a topic")
+        self._navigator.advance(self._navigator.last_imu_ns)
+        aligned = self._navigator.aligned_ns is not None
+        self._navigator.decide(Reason.OUTSIDE_IMU if aligned else Reason.BEFORE_ALIGNMENT)
+        return self._result(())
+
+    def _result(self, left_out: tuple[LeftOut, ...]) -> FusionResult:
+        navigator = self._navigator
+        return FusionResult(navigator.take_states(), navigator.take_decisions(), navigator.aligned_ns, left_out)
+
+    def _gaps(self, piece: Log, before_ns: int | None) -> tuple[LeftOut, ...]:
+        """Gaps in the IMU that end in this piece."""
+        if piece.imu is None:
+            return ()
+        t = piece.imu.t_ns if before_ns is None else np.r_[before_ns, piece.imu.t_ns]
+        gaps = int((np.diff(t) > self._config.imu.max_gap_s * 1e9).sum())
+        return (LeftOut("imu", f"gap over {self._config.imu.max_gap_s:g} s, bridged or coasted", gaps),) if gaps else ()
 
 
 def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
-    """Fuse a log in stamp order.
+    """Fuse a whole log in stamp order: a Session of one piece.
 
     States come on multiples of the output period, from alignment to the last IMU sample. Raises EgolocError for a log
     without IMU, or with pose fixes but no map frame.
     """
-    config = config or FusionConfig()
-    imu = log.imu
-    if imu is None or len(imu) < 2:
+    if log.imu is None or len(log.imu) < 2:
         raise EgolocError("the log has no IMU samples: expected sensor_msgs/msg/Imu on a topic")
-    par = parameters(log.vehicle, config)
-    found = sources(log, config)
-    order = np.lexsort((found.kind, found.t_ns))
-    initial = _align(log, config, found, order, imu)
-    if initial is None:
-        return FusionResult(states(new_recorder(0, 0)), unused(found, order, Reason.BEFORE_ALIGNMENT), None)
-    core = start(initial, imu)
-    last = int(imu.t_ns[-1])
-    timeline = merge(found, initial.t_ns + 1, last, config, log.vehicle.land_vehicle)
-    events = timeline.events
-    outputs = int((events.kind == OUTPUT).sum())
-    recorder = new_recorder(outputs, len(events.t) - outputs)
-    first = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right"))
-    feed(core, imu[first:], events, found.measurements, par, recorder)
-    applied = decisions(recorder, timeline)
-    before = order[found.t_ns[order] <= initial.t_ns]
-    early = unused(found, before, Reason.BEFORE_ALIGNMENT, initial)
-    late = unused(found, order[found.t_ns[order] > last], Reason.OUTSIDE_IMU)
-    gaps = int((np.diff(imu.t_ns) > config.imu.max_gap_s * 1e9).sum())
-    notes = (LeftOut("imu", f"gap over {config.imu.max_gap_s:g} s, bridged or coasted", gaps),) if gaps else ()
-    return FusionResult(states(recorder), join(Decisions, (early, applied, late)), initial.t_ns, notes)
+    session = Session(log.vehicle, log.map_frame, config)
+    return joined([session.push(log), session.finish()])
 
 
-def _align(log: Log, config: FusionConfig, found: Sources, order: NDArray[np.int64], imu: Imu) -> Initial | None:
-    """Offer the measurements in stamp order until the aligner has a state."""
-    aligner = Aligner(log.vehicle, config, parameters(log.vehicle, config))
-    columns = (imu.t_ns, imu.gyro, imu.accel)
-    for i in order:
-        if found.verdict[i] == APPLY and imu.t_ns[0] <= found.t_ns[i] <= imu.t_ns[-1]:
-            t = int(found.t_ns[i])
-            initial = aligner.offer(t, int(found.kind[i]), int(found.row[i]), found.measurements, columns)
-            if initial is not None:
-                return initial
-    return None
-
-
-def start(initial: Initial, imu: Imu) -> Core:
-    """A core at the first state, with the IMU sample at or before it as the last one."""
-    core = new_core()
-    before = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right")) - 1
-    core.clock[C_STATE] = initial.t_ns
-    core.clock[C_SAMPLE] = imu.t_ns[before]
-    core.clock[C_TICK] = initial.t_ns
-    core.nav[:] = initial.nav
-    covariance(core)[:] = initial.P
-    refresh(core.nav, core.earth)
-    core.last[0, :3], core.last[0, 3:] = imu.gyro[before], imu.accel[before]
-    if before > 0:
-        core.clock[C_INTERVAL] = imu.t_ns[before] - imu.t_ns[before - 1]
-        core.last[1, :3], core.last[1, 3:] = imu.gyro[before - 1], imu.accel[before - 1]
-    return core
-
-
-def feed(core: Core, imu: Imu, events: Events, measurements: Measurements, par: Parameters, rec: Recorder) -> None:
-    """Run the kernel over an IMU record and all events up to its last sample.
-
-    Every column goes in read-only and contiguous: one compiled kernel serves every log, whatever its sensors.
-    """
-    columns = Measurements(*(_read_only(column) for column in measurements))
-    process(core, _read_only(imu.t_ns), _read_only(imu.gyro), _read_only(imu.accel), events, 0, columns, par, rec)
-
-
-def _read_only(column: NDArray[Scalar]) -> NDArray[Scalar]:
-    view = np.ascontiguousarray(column).view()
-    view.flags.writeable = False
-    return view
-
-
-def states(rec: Recorder) -> States:
-    """The recorder's states."""
-    n = int(rec.filled[0])
-    nav = rec.nav[:n]
-    return States(
-        rec.t[:n],
-        nav[:, LLH],
-        nav[:, VELOCITY],
-        nav[:, QUATERNION],
-        nav[:, GYRO_BIAS],
-        nav[:, ACCEL_BIAS],
-        rec.pose_cov[:n],
-        rec.sigma_state[:n],
+def joined(results: list[FusionResult]) -> FusionResult:
+    """The result of a drive from those of its pieces."""
+    counts: dict[tuple[str, str], int] = {}
+    for entry in (entry for result in results for entry in result.left_out):
+        counts[entry.source, entry.reason] = counts.get((entry.source, entry.reason), 0) + entry.count
+    return FusionResult(
+        join(States, [result.states for result in results]),
+        join(Decisions, [result.decisions for result in results]),
+        results[-1].aligned_ns,
+        tuple(LeftOut(source, reason, count) for (source, reason), count in counts.items()),
     )
 
 
-def decisions(rec: Recorder, timeline: Timeline) -> Decisions:
-    """The recorder's decisions with the times and log rows of their events."""
-    n = int(rec.filled[1])
-    event, scores = rec.event[:n], rec.scores[:n]
-    return Decisions(
-        timeline.events.t[event],
-        timeline.arrival_ns[event],
-        rec.sensor[:n],
-        timeline.log_row[event],
-        rec.reason[:n],
-        rec.innovation[:n],
-        rec.sigma[:n],
-        scores[:, 0],
-        scores[:, 1],
-        rec.dof[:n],
-        scores[:, 2],
-        scores[:, 3],
-    )
-
-
-def unused(found: Sources, rows: NDArray[np.int64], reason: Reason, initial: Initial | None = None) -> Decisions:
-    """Decisions for measurements that never reached the kernel; the one that completed alignment says so."""
-    n = len(rows)
-    nothing: Floats = np.full(n, np.nan)
-    reasons = np.where(found.verdict[rows] == APPLY, np.int8(reason), found.verdict[rows]).astype(np.int8)
-    if initial is not None:
-        used = (found.t_ns[rows] == initial.t_ns) & (found.kind[rows] == initial.sensor)
-        reasons[used] = Reason.USED_FOR_ALIGNMENT
-    return Decisions(
-        found.t_ns[rows],
-        found.arrival_ns[rows],
-        found.kind[rows],
-        found.log_row[rows],
-        reasons,
-        np.full((n, 3), np.nan),
-        np.full((n, 3), np.nan),
-        nothing,
-        nothing,
-        np.zeros(n, np.int8),
-        nothing,
-        nothing,
-    )
-
-
-def join(kind: type[Columns], parts: Sequence[Columns]) -> Columns:
-    """Records one after the other."""
-    names = kind.__dataclass_fields__
-    return kind(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+def _last_stamp(piece: Log) -> int:
+    records = [record for name in RECORDS if (record := getattr(piece, name)) is not None and len(record)]
+    return max((int(record.t_ns[-1]) for record in records), default=-(2**63) + _START_NS)

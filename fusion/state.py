@@ -1,8 +1,9 @@
 """The state, its error and the working memory of the filter.
 
-Nominal state ``nav`` (16,): latitude rad, longitude rad, height m; velocity ENU m/s; q_enu_body xyzw; gyro bias rad/s;
-accelerometer bias m/s^2. Error state (15,): position ENU m, velocity ENU m/s, attitude rad (left error, ENU:
-``R_true = Exp(dtheta) R``), gyro bias, accelerometer bias; each is true minus estimate and is added on correction.
+Nominal state ``nav`` (17,): latitude rad, longitude rad, height m; velocity ENU m/s; q_enu_body xyzw; gyro bias rad/s;
+accelerometer bias m/s^2; scale error of the wheel speed. Error state (16,): position ENU m, velocity ENU m/s, attitude
+rad (left error, ENU: ``R_true = Exp(dtheta) R``), gyro bias, accelerometer bias, wheel scale; each is true minus
+estimate and is added on correction.
 """
 
 from typing import NamedTuple
@@ -18,21 +19,23 @@ VELOCITY = slice(3, 6)
 QUATERNION = slice(6, 10)
 GYRO_BIAS = slice(10, 13)
 ACCEL_BIAS = slice(13, 16)
-NAV_SIZE = 16
+WHEEL_SCALE = 16
+NAV_SIZE = 17
 
 E_POSITION = slice(0, 3)
 E_VELOCITY = slice(3, 6)
 E_ATTITUDE = slice(6, 9)
 E_GYRO_BIAS = slice(9, 12)
 E_ACCEL_BIAS = slice(12, 15)
-ERROR_SIZE = 15
+E_WHEEL_SCALE = 15
+ERROR_SIZE = 16
 
 RING_SIZE = 2048
 """IMU samples kept to see whether the vehicle stands still."""
 
 
-ROW = 16
-"""Rows of P, H and Phi are padded from 15 to 16 so that they fill vector registers; the last column stays zero."""
+ROW = ERROR_SIZE
+"""Length of the rows of P, H and Phi: they fill vector registers."""
 
 # first rows of what Core.acc holds, each (3,) or (3, 3)
 A_S = 0
@@ -52,6 +55,9 @@ ACC_SIZE = 14
 # entries of Core.earth
 G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8)
 
+# entries of Core.doubt_clock
+D_COUNT, D_TIME, D_AGREED = range(3)
+
 # entries of Core.clock
 C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)
 
@@ -61,12 +67,13 @@ class Core(NamedTuple):
 
     clock (6,) int64: times of the state, the last IMU sample and the last motion tick (ns), samples put into the ring,
     whether the sample before the last serves the bend, the interval before the last sample (ns).
-    nav (16,); P (15, 16); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
+    nav (17,); P (16, 16); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
     span (1,): seconds since P was propagated; acc (14, 3): the transition over them (A_*).
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
-    phi, M (9, 16), Mt (15, 16), H, W (3, 16), R, L (3, 3),
+    doubt (2, 8), doubt_clock (2, 3) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
+    phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
     """
 
@@ -80,6 +87,8 @@ class Core(NamedTuple):
     ring: Floats
     ring_t: Nanoseconds
     quietest: Floats
+    doubt: Floats
+    doubt_clock: Nanoseconds
     phi: Floats
     M: Floats
     Mt: Floats
@@ -97,7 +106,7 @@ def new_core() -> Core:
     return Core(
         clock=np.zeros(6, np.int64),
         nav=np.zeros(NAV_SIZE),
-        P=np.zeros((ERROR_SIZE, ROW)),
+        P=np.zeros((ERROR_SIZE, ERROR_SIZE)),
         last=np.zeros((2, 6)),
         span=np.zeros(1),
         acc=np.zeros((ACC_SIZE, 3)),
@@ -105,6 +114,8 @@ def new_core() -> Core:
         ring=np.zeros((RING_SIZE, 6)),
         ring_t=np.zeros(RING_SIZE, np.int64),
         quietest=np.full(2, np.inf),
+        doubt=np.zeros((2, 8)),
+        doubt_clock=np.zeros((2, 3), np.int64),
         phi=np.zeros((9, ROW)),
         M=np.zeros((9, ROW)),
         Mt=np.zeros((ERROR_SIZE, ROW)),
@@ -116,8 +127,3 @@ def new_core() -> Core:
         residual=np.zeros(3),
         dx=np.zeros(ROW),
     )
-
-
-def covariance(core: Core) -> Floats:
-    """P as a (15, 15) view."""
-    return core.P[:, :ERROR_SIZE]

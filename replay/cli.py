@@ -9,9 +9,11 @@ from typing import Annotated, Any
 
 import tyro
 
+from replay.commands.comparing import Compare, Score
+from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import Bench, View
-from replay.commands.replaying import Demo, Replay, Score
+from replay.commands.replaying import Replay
 from sensors.errors import EgolocError
 
 COMMANDS = {
@@ -21,6 +23,7 @@ COMMANDS = {
     "info": Info,
     "replay": Replay,
     "score": Score,
+    "compare": Compare,
     "view": View,
     "bench": Bench,
 }
@@ -28,7 +31,7 @@ DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the f
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 2 a user's mistake (one line on standard error)."""
+    """Run one command; returns the exit code: 0 done, 1 some logs failed, 2 a user's mistake (one line on stderr)."""
     given = tuple(sys.argv[1:] if arguments is None else arguments)
     choices: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
     command = tyro.cli(
@@ -39,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     try:
-        command.run(("egoloc", *given))
+        return command.run(("egoloc", *given)) or 0
     except EgolocError as error:
         return _fail(str(error))
     except BrokenPipeError:  # the reader of our output has gone: not an error, and nothing more to say
@@ -49,10 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail("not enough memory: try a shorter log or a lower output_hz")
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
-    except KeyboardInterrupt:
-        print("egoloc: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(": ".join(("egoloc: interrupted", *map(str, interrupt.args))), file=sys.stderr)
         return 130
-    return 0
 
 
 def _fail(message: str) -> int:

@@ -7,95 +7,139 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion.result import Decisions, Reason, Sensor
-from replay.hiding import Rows
-from replay.references import Reference, errors, evaluated_only, lever, sample
-from sensors.clock import NS_PER_S
+from replay.references import Samples, errors, evaluated_only, lever
 from sensors.geodesy import MapFrame, map_from_llh, rotation_map_enu
 from sensors.records import GnssFix, GnssStatus, Log, PoseFix
 from sensors.rotation import wrap
+from sensors.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
 Columns = dict[str, NDArray[Any]]
+Point = tuple[float, float, float]
 
 APPLIED = (Reason.ACCEPTED, Reason.PARTLY_ACCEPTED, Reason.USED_FOR_ALIGNMENT)
-FIX_COLUMNS = ("x", "y", "z", "yaw", "err_lon", "err_lat", "err_yaw")
+FIXES = (Sensor.GNSS_POSITION, Sensor.POSE_FIX)
+"""Measurements of a point in the map."""
+_IS_APPLIED = np.isin(np.arange(len(Reason)), APPLIED)
+ERRORS = ("err_lon", "err_lat", "err_yaw")
+_MEASURED = ("x", "y", "z", "yaw", *ERRORS)
 
 
 def decision_columns(
-    decisions: Decisions, log: Log, frame: MapFrame, reference: Reference | None, rows: Mapping[Sensor, Rows]
+    decisions: Decisions, rows: Rows, measured: Mapping[Sensor, Columns], *, all_columns: bool = True
 ) -> Columns:
-    """The columns of decisions.parquet. log: as the filter got it; rows: where thinned records kept the original's."""
+    """The columns of decisions.parquet; all_columns: not only those that scoring reads.
+
+    rows: (M,) of the records as the log holds them; measured: what ``gnss_columns`` and ``pose_columns`` say of the
+    FIXES, one row per decision on one.
+    """
     columns: Columns = {
         "t_ns": decisions.t_ns,
         "arrival_ns": decisions.arrival_ns,
         "sensor": decisions.sensor.astype(np.int8),
-        "row": _original_rows(decisions, rows),
+        "row": rows,
         "reason": decisions.reason.astype(np.int8),
-        "accepted": np.isin(decisions.reason, APPLIED),
+        "accepted": _IS_APPLIED[decisions.reason],
     }
+    if all_columns:
+        columns |= _tests_of(decisions)
+    spread: Columns = {name: np.full(len(rows), np.nan) for name in (_MEASURED if all_columns else ERRORS)}
+    spread["status"] = np.full(len(rows), -1, np.int8)
+    for sensor, fixes in measured.items():
+        here = np.flatnonzero(decisions.sensor == sensor)
+        for name in spread.keys() & fixes.keys():
+            spread[name][here] = fixes[name]
+    return columns | spread
+
+
+def no_rows() -> Columns:
+    """The columns of decisions.parquet, without a row."""
+    t_ns, codes, one, three = np.empty(0, np.int64), np.empty(0, np.int8), np.empty(0), np.empty((0, 3))
+    none = Decisions(t_ns, t_ns, codes, t_ns, codes, three, three, one, one, codes, one, one)
+    return decision_columns(none, t_ns, {})
+
+
+def _tests_of(decisions: Decisions) -> Columns:
+    """Innovations and how they were judged."""
+    columns: Columns = {}
     for name in ("innovation", "innovation_sigma"):
         columns |= {f"{name}_{i}": column.astype(np.float32) for i, column in enumerate(getattr(decisions, name).T)}
-    columns |= {
-        name: getattr(decisions, name).astype(np.float32) for name in ("nis", "threshold", "moved_m", "moved_yaw")
-    }
-    columns["dof"] = decisions.dof.astype(np.int8)
-    measured: Columns = {name: np.full(len(decisions.t_ns), np.nan) for name in FIX_COLUMNS}
-    measured["status"] = np.full(len(decisions.t_ns), -1, np.int8)
-    for sensor, fixes in _fixes(log, frame, reference).items():
-        here = np.flatnonzero(decisions.sensor == sensor)
-        for name, column in fixes.items():
-            measured[name][here] = column[decisions.row[here]]
-    return columns | measured
+    for name in ("nis", "threshold", "moved_m", "moved_yaw"):
+        columns[name] = getattr(decisions, name).astype(np.float32)
+    return columns | {"dof": decisions.dof.astype(np.int8)}
 
 
-def _fixes(log: Log, frame: MapFrame, reference: Reference | None) -> dict[Sensor, Columns]:
-    """Measured points of GNSS and pose fixes in map coordinates, with their errors, one row per row of the record."""
-    fixes = {}
-    if log.gnss is not None:
-        hidden = reference is not None and reference.stretches is not None  # its own fixes are the reference
-        fixes[Sensor.GNSS_POSITION] = gnss_columns(log.gnss, log, frame, None if hidden else reference)
-    if log.pose_fixes is not None:
-        fixes[Sensor.POSE_FIX] = pose_columns(log.pose_fixes, log, reference)
-    return fixes
+class Fixes:
+    """GNSS and pose fixes of a drive until a decision on each has been taken: decisions name them by row."""
+
+    def __init__(self) -> None:
+        self._waiting = {Sensor.GNSS_POSITION: _Waiting("llh", "yaw", "status"), Sensor.POSE_FIX: _Waiting("pose")}
+
+    def add(self, piece: Log) -> None:
+        """Take the fixes of the next piece, as the filter gets it."""
+        for sensor, record in ((Sensor.GNSS_POSITION, piece.gnss), (Sensor.POSE_FIX, piece.pose_fixes)):
+            if record is not None:
+                self._waiting[sensor].add(record)
+
+    def take(self, sensor: Sensor, rows: Rows) -> Columns:
+        """Columns of rows (M,) of the drive's record, each asked for once."""
+        return self._waiting[sensor].take(rows)
 
 
-def gnss_columns(gnss: GnssFix, log: Log, frame: MapFrame, reference: Reference | None) -> Columns:
-    """Antenna positions (map m), yaw (map axes) and errors of GNSS fixes; a fix of status none has neither."""
-    p_map = map_from_llh(frame, gnss.llh)
-    yaw = gnss.yaw
+class _Waiting:
+    """Columns of the rows of one record that nobody has asked for."""
+
+    def __init__(self, *names: str) -> None:
+        self._names, self._first = names, 0
+        self._columns: Columns = {}
+        self._asked = np.empty(0, np.bool_)
+
+    def add(self, record: GnssFix | PoseFix) -> None:
+        new = {name: getattr(record, name) for name in self._names}
+        held = len(self._asked) > 0
+        self._columns = {name: np.concatenate((self._columns[name], new[name])) for name in new} if held else new
+        self._asked = np.concatenate((self._asked, np.zeros(len(record), np.bool_)))
+
+    def take(self, rows: Rows) -> Columns:
+        local = rows - self._first
+        taken = {name: column[local] for name, column in self._columns.items()}
+        self._asked[local] = True
+        done = len(self._asked) if self._asked.all() else int(np.argmin(self._asked))
+        self._columns = {name: column[done:] for name, column in self._columns.items()}
+        self._asked = self._asked[done:]
+        self._first += done
+        return taken
+
+
+def gnss_columns(fixes: Columns, vehicle: Vehicle, frame: MapFrame, samples: Samples | None, point: Point) -> Columns:
+    """Antenna positions (map m), yaw (map axes) and errors of GNSS fixes; a fix of status none has neither.
+
+    samples: the reference when the fixes were true, of the body's point; None: nothing to compare with.
+    """
+    p_map = map_from_llh(frame, fixes["llh"])
+    yaw, status = fixes["yaw"], fixes["status"]
     if np.isfinite(yaw).any():
-        R_map_enu, _ = rotation_map_enu(frame, gnss.llh)
+        R_map_enu, _ = rotation_map_enu(frame, fixes["llh"])
         yaw = wrap(yaw + np.arctan2(R_map_enu[:, 1, 0], R_map_enu[:, 0, 0]))
-    t_ns = gnss.t_ns - round(log.vehicle.gnss_delay_s * NS_PER_S)
-    columns = _fix_columns(t_ns, p_map, yaw, log.vehicle.gnss_lever_arm, reference)
-    for name in ("err_lon", "err_lat", "err_yaw"):
-        columns[name] = np.where(gnss.status > GnssStatus.NONE, columns[name], np.nan)
-    return columns | {"z": p_map[:, 2], "status": gnss.status}
+    columns = _fix_columns(p_map, yaw, vehicle.gnss_lever_arm, samples, point)
+    for name in ERRORS:
+        columns[name] = np.where(status > GnssStatus.NONE, columns[name], np.nan)
+    return columns | {"z": p_map[:, 2], "status": status}
 
 
-def pose_columns(fixes: PoseFix, log: Log, reference: Reference | None) -> Columns:
+def pose_columns(fixes: Columns, vehicle: Vehicle, samples: Samples | None, point: Point) -> Columns:
     """Points, yaw and errors of pose fixes, map axes."""
-    return _fix_columns(fixes.t_ns, fixes.pose[:, :2], fixes.pose[:, 2], log.vehicle.pose_lever_arm, reference)
+    pose = fixes["pose"]
+    return _fix_columns(pose[:, :2], pose[:, 2], vehicle.pose_lever_arm, samples, point)
 
 
-def _fix_columns(
-    t_ns: NDArray[np.int64], p_map: Floats, yaw: Floats, point: ArrayLike, reference: Reference | None
-) -> Columns:
+def _fix_columns(p_map: Floats, yaw: Floats, measured: ArrayLike, samples: Samples | None, point: Point) -> Columns:
     """Measured points (N, 2 or 3) and yaw (N,), and their errors against the reference at that point of the body."""
-    lon = lat = err_yaw = np.full(len(t_ns), np.nan)
-    if reference is not None:
-        samples = sample(reference.trajectory, t_ns)
-        arm = lever(samples, np.asarray(point) - np.asarray(reference.point))
+    lon = lat = err_yaw = np.full(len(p_map), np.nan)
+    if samples is not None:
+        arm = lever(samples, np.asarray(measured, np.float64) - np.asarray(point))
         lon, lat = errors(samples, p_map[:, :2] - (samples.p_map + arm)[:, :2]).T
         if samples.has_heading:
             err_yaw = evaluated_only(samples, wrap(yaw - samples.heading))
     return {"x": p_map[:, 0], "y": p_map[:, 1], "yaw": yaw, "err_lon": lon, "err_lat": lat, "err_yaw": err_yaw}
-
-
-def _original_rows(decisions: Decisions, rows: Mapping[Sensor, Rows]) -> NDArray[np.int64]:
-    """Row numbers of the records as the log holds them."""
-    original = decisions.row.astype(np.int64)
-    for sensor, kept in rows.items():
-        here = decisions.sensor == sensor
-        original[here] = kept[original[here]]
-    return original

@@ -1,63 +1,171 @@
 """What a log holds, and what a replay would make of it."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
-from replay.plausibility import imu_findings
-from replay.references import gap_ns, has_heading
-from replay.requirements import what_is_missing
+from replay.plausibility import ImuWatch
+from replay.references import GAP_NS, GAP_PERIODS
+from replay.requirements import Contents
 from replay.table import output_console
 from sensors.clock import NS_PER_S
-from sensors.errors import EgolocError
-from sensors.records import GnssStatus, Log
+from sensors.pieces import SENSORS, summed
+from sensors.records import GnssStatus, LeftOut, Log, Tags, Trajectory
+from sensors.steps import Steps
 from sensors.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from sensors.mcap.io import TopicSummary
 
-SENSORS = ("imu", "gnss", "gnss_velocity", "pose_fixes", "wheel", "reference")
+
+class Inventory:
+    """What the pieces of a drive hold, counted as they come."""
+
+    def __init__(self) -> None:
+        self._steps: dict[str, Steps] = {sensor: Steps() for sensor in SENSORS}
+        self._status = np.zeros(len(GnssStatus), np.int64)
+        self._tags = {"scene": _TagTimes(), "mode": _TagTimes()}
+        self._contents = Contents()
+        self._imu: ImuWatch | None = None
+        self._headings = 0
+        self._first = Log()
+        self._left_out: list[LeftOut] = []
+
+    def add(self, piece: Log) -> None:
+        """The next piece."""
+        if self._imu is None:
+            self._first, self._imu = Log(vehicle=piece.vehicle, map_frame=piece.map_frame), _imu_watch(piece)
+        for sensor in SENSORS:
+            record = getattr(piece, sensor)
+            if record is not None:
+                self._steps[sensor].add(record.t_ns)
+        if piece.imu is not None:
+            self._imu.add(piece.imu)
+        if piece.gnss is not None:
+            self._status += np.bincount(piece.gnss.status, minlength=len(GnssStatus))
+        if piece.reference is not None:
+            self._headings += _headings(piece.reference)
+        self._tags["scene"].add(piece.scene)
+        self._tags["mode"].add(piece.mode)
+        self._contents.add(piece)
+        self._left_out = list(summed((*self._left_out, *piece.left_out)))
+
+    def watch(self, pieces: Iterable[Log]) -> Iterator[Log]:
+        """The pieces, counted on their way."""
+        for piece in pieces:
+            self.add(piece)
+            yield piece
+
+    def found(self, name: str) -> dict[str, Any]:
+        """Sensors with rates and gaps, tags, vehicle, map frame, what was left out, remarks on a replay; JSON-ready.
+
+        name: of the log.
+        """
+        present = {sensor: steps for sensor, steps in self._steps.items() if steps.count}
+        first = min((steps.first_ns for steps in present.values() if steps.first_ns is not None), default=None)
+        last = max((steps.last_ns for steps in present.values() if steps.last_ns is not None), default=None)
+        start = None if first is None else datetime.fromtimestamp(first / NS_PER_S, UTC)
+        return {
+            "log": name,
+            "start_utc": None if start is None else start.isoformat(timespec="milliseconds"),
+            "duration_s": 0.0 if first is None or last is None else (last - first) / NS_PER_S,
+            "sensors": {sensor: timing(steps, regular=sensor not in self._tags) for sensor, steps in present.items()},
+            "gnss_status": {s.name.lower(): int(n) for s, n in zip(GnssStatus, self._status, strict=True) if n},
+            **{f"{kind}_s": {} if last is None else times.until(last) for kind, times in self._tags.items()},
+            "vehicle": msgspec.to_builtins(self._first.vehicle),
+            "map_frame": msgspec.to_builtins(self._first.map_frame),
+            "left_out": [msgspec.to_builtins(row) for row in self._left_out],
+            "remarks": list(self._remarks()),
+        }
+
+    def _remarks(self) -> Iterator[str]:
+        """What a replay would do with this log, or why it cannot, and what is odd about its IMU."""
+        missing = self._contents.missing()
+        if missing is not None or self._imu is None:
+            yield f"It cannot be replayed: {missing}."
+            return
+        for _, finding in self._imu.findings():
+            yield f"WARNING: {finding}"
+        counts = {sensor: steps.count for sensor, steps in self._steps.items()}
+        if (counts["pose_fixes"] or counts["reference"]) and self._first.map_frame is None:
+            yield "Map coordinates without a map frame: a replay needs [map_frame] in its config."
+        if self._first.vehicle == Vehicle():
+            yield "Nothing is known of the vehicle: lever arms of zero and the default IMU are taken."
+        if counts["reference"]:
+            heading = 2 * self._headings >= counts["reference"]
+            yield "A replay is scored against its reference" + (
+                "." if heading else ", in position only: it has no heading."
+            )
+        elif self._status[GnssStatus.FIXED]:
+            yield "No reference: a replay is scored with --reference FILE, or with --hide-gnss against its fixed fixes."
+        else:
+            yield "No reference: a replay is scored only with --reference FILE."
 
 
-def inventory(log: Log, name: str) -> dict[str, Any]:
-    """Sensors with rates and gaps, vehicle, map frame, what was left out, and remarks on a replay; JSON-ready."""
-    records = {sensor: getattr(log, sensor) for sensor in SENSORS}
-    present = {sensor: record.t_ns for sensor, record in records.items() if record is not None and len(record)}
-    found: dict[str, Any] = {
-        "log": name,
-        "start_utc": None,
-        "duration_s": 0.0,
-        "sensors": {sensor: timing(t_ns) for sensor, t_ns in present.items()},
-        "gnss_status": _statuses(log),
-        "vehicle": msgspec.to_builtins(log.vehicle),
-        "map_frame": msgspec.to_builtins(log.map_frame),
-        "left_out": [{"source": row.source, "reason": row.reason, "count": row.count} for row in log.left_out],
-        "remarks": list(remarks(log)),
-    }
-    if present:
-        start, end = min(int(t[0]) for t in present.values()), max(int(t[-1]) for t in present.values())
-        found["start_utc"] = datetime.fromtimestamp(start / NS_PER_S, UTC).isoformat(timespec="milliseconds")
-        found["duration_s"] = (end - start) / NS_PER_S
-    return found
+@dataclass(slots=True)
+class _TagTimes:
+    """For how long each tag held, ns; since: when the text that holds now began."""
+
+    ns: Counter[str] = field(default_factory=Counter)
+    since: int | None = None
+    text: str = ""
+
+    def add(self, tags: Tags | None) -> None:
+        if tags is not None:
+            for t_ns, text in zip(tags.t_ns.tolist(), tags.text.tolist(), strict=True):
+                self._hold(t_ns)
+                self.since, self.text = t_ns, text
+
+    def _hold(self, t_ns: int) -> None:
+        if self.since is not None:
+            for tag in {tag.strip() for tag in self.text.split(",")} - {""}:
+                self.ns[tag] += t_ns - self.since
+
+    def until(self, end_ns: int) -> dict[str, float]:
+        """Tag -> seconds, where the last text holds until the end."""
+        times = _TagTimes(Counter(self.ns), self.since, self.text)
+        times._hold(end_ns)
+        return {tag: ns / NS_PER_S for tag, ns in sorted(times.ns.items())}
+
+
+def _imu_watch(piece: Log) -> ImuWatch:
+    return ImuWatch(land_vehicle=piece.vehicle.land_vehicle)
+
+
+def _headings(reference: Trajectory) -> int:
+    """Rows with an attitude."""
+    return int(np.isfinite(reference.q_map_body[:, 3]).sum())
+
+
+def inventory(log: Log | Iterable[Log], name: str) -> dict[str, Any]:
+    """The inventory of a log or of its pieces."""
+    counted = Inventory()
+    for piece in [log] if isinstance(log, Log) else log:
+        counted.add(piece)
+    return counted.found(name)
 
 
 def file_inventory(path: Path, topics: Mapping[str, str]) -> dict[str, Any]:
-    """The inventory of an MCAP file, with its topics and the state of the file. topics: sensor -> topic, as chosen."""
-    from sensors.mcap.io import describe, read_log
+    """The inventory of an MCAP file of any length, with its topics and the state of the file; it is read once.
 
-    summary = describe(path, topics)
-    try:
-        found = inventory(read_log(path, topics), str(path))
-    except EgolocError as error:  # two topics for one sensor
+    topics: sensor -> topic, as chosen.
+    """
+    from sensors.mcap.io import describe
+
+    counted = Inventory()
+    summary = describe(path, topics, visit=counted.add)
+    found = counted.found(str(path))
+    if summary.conflict:
         known = Log(vehicle=summary.vehicle, map_frame=summary.map_frame, left_out=summary.left_out)
-        found = inventory(known, str(path)) | {"remarks": [f"Not to be replayed as it is: {error}."]}
+        found = inventory(known, str(path)) | {"remarks": [f"Not to be replayed as it is: {summary.conflict}."]}
     found["topics"] = [_topic(topic) for topic in summary.topics]
     found["file"] = {
         "bytes": summary.size_bytes,
@@ -88,40 +196,19 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def timing(t_ns: NDArray[np.int64]) -> dict[str, Any]:
-    """Count, median rate, span, and pauses too long to be bridged."""
-    steps = np.diff(t_ns)
-    gaps = steps[steps > gap_ns(t_ns)]
+def timing(steps: Steps, *, regular: bool) -> dict[str, Any]:
+    """Count, median rate, span, and pauses too long to be bridged, of a sensor with rows; tags are not regular."""
+    assert steps.first_ns is not None
+    assert steps.last_ns is not None
+    gap_ns = int(np.clip(GAP_PERIODS * (steps.median_ns() or 0.0), *GAP_NS))
+    gaps = steps.above(gap_ns) if regular else 0
     return {
-        "count": len(t_ns),
-        "rate_hz": float(NS_PER_S / np.median(steps)) if len(steps) else None,
-        "span_s": float((t_ns[-1] - t_ns[0]) / NS_PER_S),
-        "gaps": len(gaps),
-        "longest_gap_s": float(gaps.max() / NS_PER_S) if len(gaps) else None,
+        "count": steps.count,
+        "rate_hz": steps.rate_hz() if regular else None,
+        "span_s": (steps.last_ns - steps.first_ns) / NS_PER_S,
+        "gaps": gaps,
+        "longest_gap_s": (steps.longest_ns or 0) / NS_PER_S if gaps else None,
     }
-
-
-def remarks(log: Log) -> Iterator[str]:
-    """What a replay would do with this log, or why it cannot, and what is odd about its IMU."""
-    missing = what_is_missing(log)
-    if missing is not None or log.imu is None:
-        yield f"It cannot be replayed: {missing}."
-        return
-    for _, finding in imu_findings(log.imu, land_vehicle=log.vehicle.land_vehicle):
-        yield f"WARNING: {finding}"
-    mapped = log.pose_fixes is not None or log.reference is not None
-    if mapped and log.map_frame is None:
-        yield "Map coordinates without a map frame: a replay needs [map_frame] in its config."
-    if log.vehicle == Vehicle():
-        yield "Nothing is known of the vehicle: lever arms of zero and the default IMU are taken."
-    if log.reference is not None and len(log.reference):
-        yield "A replay is scored against its reference" + (
-            "." if has_heading(log.reference) else ", in position only: it has no heading."
-        )
-    elif log.gnss is not None and (log.gnss.status == GnssStatus.FIXED).any():
-        yield "No reference: a replay is scored with --reference FILE, or with --hide-gnss against its fixed fixes."
-    else:
-        yield "No reference: a replay is scored only with --reference FILE."
 
 
 def print_inventory(found: Mapping[str, Any]) -> None:
@@ -134,6 +221,9 @@ def print_inventory(found: Mapping[str, Any]) -> None:
     console.print(_sensor_table(found["sensors"]), "")
     if found["gnss_status"]:
         console.print("GNSS: " + ", ".join(f"{n} {status}" for status, n in found["gnss_status"].items()))
+    for kind, label in (("scene_s", "Scene"), ("mode_s", "Drive mode")):
+        if found[kind]:
+            console.print(f"{label}: {_tag_text(found[kind])}")
     console.print(_frame_text(found["map_frame"]))
     console.print(_vehicle_text(found["vehicle"]))
     for row in found["left_out"]:
@@ -169,11 +259,8 @@ def _sensor_table(sensors: Mapping[str, Mapping[str, Any]]) -> Table:
     return table
 
 
-def _statuses(log: Log) -> dict[str, int]:
-    if log.gnss is None:
-        return {}
-    counts = np.bincount(log.gnss.status, minlength=len(GnssStatus))
-    return {status.name.lower(): int(n) for status, n in zip(GnssStatus, counts, strict=True) if n}
+def _tag_text(times: Mapping[str, float]) -> str:
+    return ", ".join(f"{tag} {seconds:.1f} s" for tag, seconds in times.items())
 
 
 def _frame_text(frame: Mapping[str, Any] | None) -> str:

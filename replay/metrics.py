@@ -1,150 +1,168 @@
-"""Availability ratio and errors of localization outputs, as defined in docs/metrics.md. Pure functions over arrays.
+"""The contents of metrics.json, of a log or a campaign, from its sums (docs/metrics.md)."""
 
-Errors are (N, 3): longitudinal m, lateral m, yaw rad; estimate minus reference; NaN where an axis is not estimated.
-"""
-
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from replay.config import Limits
+from replay.segments import AXES, BELOW, METHODS, THRESHOLDS, Segments, tags
+from replay.sketch import Sketch, percentiles
+from replay.sums import Counts, Sums
 from sensors.clock import NS_PER_S
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Nanoseconds = NDArray[np.int64]
+Metrics = dict[str, Any]
 
-THRESHOLDS = {"lon": (0.1, 0.2, 0.3), "lat": (0.1, 0.2, 0.3), "yaw": (0.1, 0.3, 0.6)}
-"""m, m, deg."""
-COVER_PERIODS = 1.5
-"""A sample covers at most this many nominal periods."""
 SIGMA_SHARE = 1 / 3
 """The reference's sigma must not exceed this share of the limit."""
-LARGEST_ERROR = 1e100
-"""What a diverged filter is off at most: its square is still a number."""
 MIN_EVALUATED_NS = 10 * NS_PER_S
 """With less evaluated time than this nothing is said."""
 MIN_DISTANCE_M = 1.0
 """With less evaluated distance than this there is no distance-weighted ratio, m."""
+SHARES = {"p50": 50, "p95": 95, "p99": 99}
+NOT_EVALUATED: Mapping[str, None] = dict.fromkeys(("ar", "ar_distance", "coverage", *AXES))
 
 
-def cover_ns(t_ns: Nanoseconds, nominal_ns: float | None = None) -> Floats:
-    """(N,) ns that each sample stands for: back to the one before it, COVER_PERIODS nominal periods at most.
-
-    nominal_ns: the period, or None for the median of the samples' own. The first sample covers nothing. Whole
-    nanoseconds are exact in float64 over 100 days.
-    """
-    steps = np.diff(t_ns).astype(np.float64)
-    nominal = nominal_ns if nominal_ns is not None else float(np.median(steps)) if len(steps) else 0.0
-    result: Floats = np.minimum(np.r_[0.0, steps], COVER_PERIODS * nominal)[: len(t_ns)]
-    return result
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Span:
-    """The evaluated time: pieces ]end - cover, end] of it, each with how much of it (0 or all) is evaluated.
-
-    edges: (2 N,) ns since origin_ns; time, distance: (2 N,) ns and m evaluated up to each edge.
-    """
-
-    origin_ns: int
-    edges: Floats
-    time: Floats
-    distance: Floats
-
-    @property
-    def total_ns(self) -> float:
-        return float(self.time[-1]) if len(self.time) else 0.0
-
-    @property
-    def total_m(self) -> float:
-        return float(self.distance[-1]) if len(self.distance) else 0.0
-
-    def weights(self, t_ns: Nanoseconds, cover: Floats) -> tuple[Floats, Floats]:
-        """(N,) evaluated ns and (N,) evaluated m within cover (N,) ns before each time."""
-        if not len(self.edges):
-            return np.zeros(len(t_ns)), np.zeros(len(t_ns))
-        end = (t_ns - self.origin_ns).astype(np.float64)
-        upto = [
-            (np.interp(end, self.edges, y), np.interp(end - cover, self.edges, y)) for y in (self.time, self.distance)
-        ]
-        return upto[0][0] - upto[0][1], upto[1][0] - upto[1][1]
+def metrics_of(sums: Sums, logs: Mapping[str, Any] | None = None) -> Metrics:
+    """metrics.json. logs: of a campaign, how many there are, were done, and failed ("total", "done", "failed")."""
+    counts, segments = sums.counts, sums.segments
+    metrics: Metrics = {
+        "limits": {"lon_m": counts.limits.lon_m, "lat_m": counts.limits.lat_m, "yaw_deg": counts.limits.yaw_deg},
+        "order": counts.order,
+        "reference": counts.reference,
+        "span_s": counts.span_ns / NS_PER_S,
+        **_exposure(segments),
+        "excluded": counts.excluded,
+    }
+    if counts.hidden_length_s is not None:
+        metrics["hidden"] = _hidden(counts)
+    metrics["methods"] = _methods(counts, segments, sums.sketch)
+    metrics["slices"] = {kind: _slices(sums, kind) for kind in ("scene", "mode") if segments.tags(kind)}
+    metrics["alignment_s"] = counts.alignment_s
+    metrics["decisions"] = counts.decisions
+    metrics["left_out"] = counts.left_out
+    metrics["warnings"] = counts.warnings
+    if logs is not None:
+        metrics["warning_counts"] = counts.warning_counts
+        metrics["logs"] = dict(logs)
+    return metrics
 
 
-def evaluated_span(t_ns: Nanoseconds, evaluated: Mask, speed: Floats, period_ns: float) -> Span:
-    """The span of a grid of increasing epochs t_ns (N,), of which some are evaluated; speed: (N,) m/s, reference."""
-    if not len(t_ns):
-        return Span(0, *(np.empty(0) for _ in range(3)))
-    cover = cover_ns(t_ns, period_ns)
-    time = np.where(evaluated, cover, 0.0)
-    distance = np.where(evaluated & np.isfinite(speed), cover * speed / NS_PER_S, 0.0)
-    ends = (t_ns - t_ns[0]).astype(np.float64)
-    edges = np.stack((ends - cover, ends), axis=-1).ravel()
-    return Span(int(t_ns[0]), edges, *(np.repeat(np.cumsum(np.r_[0.0, y]), 2)[1:-1] for y in (time, distance)))
-
-
-def well_known(sigma: Floats, limits: Limits, *, yaw: bool) -> tuple[Mask, Mask]:
-    """Which epochs (N,) have a reference well below the limits, in position and in yaw.
+def well_known(sigma: Floats, limits: Limits, *, heading: Mask) -> tuple[Mask, Mask]:
+    """Which epochs (N,) have a reference well below the limits, in position and, where it has a heading, in yaw.
 
     sigma: (N, 2) m and rad; NaN (unknown) passes.
     """
     position = ~(sigma[:, 0] > SIGMA_SHARE * min(limits.lon_m, limits.lat_m))
-    return position, ~(sigma[:, 1] > SIGMA_SHARE * np.radians(limits.yaw_deg)) if yaw else np.ones(len(sigma), bool)
+    return position, ~heading | ~(sigma[:, 1] > SIGMA_SHARE * np.radians(limits.yaw_deg))
 
 
-def axis_metrics(error: Floats, thresholds: tuple[float, ...]) -> dict[str, Any] | None:
-    """MAE, RMSE, percentiles and shares below thresholds of the finite errors (N,); None if there is none."""
-    size = np.sort(np.minimum(np.abs(error[np.isfinite(error)]), LARGEST_ERROR))
-    if not len(size):
-        return None
-    p50, p95, p99 = np.percentile(size, (50, 95, 99))
+def _exposure(segments: Segments) -> Metrics:
+    """How much was evaluated: fusion can be compared wherever there is a reference."""
+    of = segments.of_method("fusion")
     return {
-        "mae": float(size.mean()),
-        "rmse": float(np.sqrt(np.mean(size * size))),
-        "p50": float(p50),
-        "p95": float(p95),
-        "p99": float(p99),
-        "max": float(size[-1]),
-        "below": {f"{t:g}": float(np.searchsorted(size, t, side="left") / len(size)) for t in thresholds},
+        "duration_s": _evaluated_ns(segments) / NS_PER_S,
+        "distance_m": math.fsum(segments.columns["evaluated_m"][of]),
+        "epochs": int(segments.columns["epochs"][of].sum()),
     }
 
 
-def within_limits(error: Floats, limits: Limits, *, yaw: bool) -> Mask:
-    """(N,) all estimated axes below their limits; NaN is not."""
-    inside: Mask = (np.abs(error[:, 0]) < limits.lon_m) & (np.abs(error[:, 1]) < limits.lat_m)
-    return inside & (np.abs(error[:, 2]) < np.radians(limits.yaw_deg)) if yaw else inside
+def _evaluated_ns(segments: Segments) -> int:
+    return int(segments.columns["evaluated_ns"][segments.of_method("fusion")].sum())
 
 
-NOT_EVALUATED: Mapping[str, None] = dict.fromkeys(("ar", "ar_distance", "coverage", "lon", "lat", "yaw"))
+def _slices(sums: Sums, kind: str) -> Metrics:
+    """Exposure and methods by scene tag or mode; a row with several tags counts in each."""
+    place = ("scene", "mode").index(kind)
+    slices = {}
+    for tag in sums.segments.tags(kind):
+        segments = sums.segments.chosen(sums.segments.tagged(kind, tag))
+        exposure = _exposure(segments)
+        slices[tag] = {
+            "hours": exposure["duration_s"] / 3600,
+            "km": exposure["distance_m"] / 1000,
+            "epochs": exposure["epochs"],
+            "methods": _methods(sums.counts, segments, sums.sketch.chosen(lambda key: tag in tags(key[place]))),  # noqa: B023
+        }
+    return slices
 
 
-def method_metrics(
-    error: Floats, time: Floats, distance: Floats, total_ns: float, total_m: float, limits: Limits
-) -> dict[str, Any]:
-    """One method's entry of metrics.json.
+def _methods(counts: Counts, segments: Segments, sketch: Sketch) -> Metrics:
+    """One entry a method that has data."""
+    least: float = MIN_EVALUATED_NS
+    if counts.hidden_length_s is not None:
+        least = min(least, 0.9 * counts.hidden_length_s * NS_PER_S)
+    enough = _evaluated_ns(segments) >= max(least, 1)
+    return {
+        method: method_metrics(segments.chosen(segments.of_method(method)), sketch, method)
+        if enough
+        else dict(NOT_EVALUATED)
+        for method in methods_of(counts)
+    }
 
-    error: (N, 3) of its outputs; time, distance: (N,) evaluated ns and m that each stands for (0: not evaluated);
-    total_ns, total_m: all evaluated time and distance. An axis without a finite error is not estimated: left out of AR.
-    """
+
+def methods_of(counts: Counts) -> list[str]:
+    """The methods with data, in the order of METHODS."""
+    sensor = {"gnss": "gnss_position", "egovm": "pose_fix"}
+    hidden = counts.hidden_length_s is not None
+    present = [name for name in sensor if sensor[name] in counts.decisions and not (hidden and name == "gnss")]
+    return [name for name in METHODS if name in (*present, "fusion")]
+
+
+def method_metrics(rows: Segments, sketch: Sketch, method: str) -> Metrics:
+    """One method's entry of metrics.json, from its rows."""
+    columns = rows.columns
+    total_ns, total_m = int(columns["evaluated_ns"].sum()), math.fsum(columns["evaluated_m"])
     if total_ns <= 0:
         return dict(NOT_EVALUATED)
-    scored = (time > 0) & np.isfinite(error[:, :2]).all(axis=1)
-    error, time, distance = error[scored], time[scored], distance[scored]
-    yaw = axis_metrics(np.degrees(error[:, 2]), THRESHOLDS["yaw"])
-    good = within_limits(error, limits, yaw=yaw is not None)
     return {
-        "ar": _share(time[good].sum(), total_ns),
-        "ar_distance": _share(distance[good].sum(), total_m) if total_m >= MIN_DISTANCE_M else None,
-        "coverage": _share(time.sum(), total_ns),
-        "lon": axis_metrics(error[:, 0], THRESHOLDS["lon"]),
-        "lat": axis_metrics(error[:, 1], THRESHOLDS["lat"]),
-        "yaw": yaw,
+        "ar": int(columns["good_ns"].sum()) / total_ns,
+        "ar_distance": _share(math.fsum(columns["good_m"]), total_m) if total_m >= MIN_DISTANCE_M else None,
+        "coverage": int(columns["covered_ns"].sum()) / total_ns,
+        **{axis: _axis_metrics(rows, sketch, method, axis) for axis in AXES},
+    }
+
+
+def _axis_metrics(rows: Segments, sketch: Sketch, method: str, axis: str) -> Metrics | None:
+    """MAE, RMSE, percentiles and shares below thresholds of an axis; None if it has no error."""
+    columns = rows.columns
+    count = int(columns[f"{axis}_count"].sum())
+    if not count:
+        return None
+    largest = float(columns[f"{axis}_max"].max())
+    histogram = sketch.total(lambda key: key[2:] == (method, axis))
+    return {
+        "mae": math.fsum(columns[f"{axis}_abs"]) / count,
+        "rmse": math.sqrt(math.fsum(columns[f"{axis}_squared"]) / count),
+        **dict(zip(SHARES, percentiles(histogram, SHARES.values(), largest), strict=True)),
+        "max": largest,
+        "below": {
+            f"{threshold:g}": int(columns[name].sum()) / count
+            for threshold, name in zip(THRESHOLDS[axis], BELOW[axis], strict=True)
+        },
+    }
+
+
+def _hidden(counts: Counts) -> Metrics:
+    """How far the filter had drifted at the end of every stretch without GNSS."""
+    ends = [stretch for stretch in counts.stretches if stretch["end_horizontal_m"] is not None]
+    error = np.array([stretch["end_horizontal_m"] for stretch in ends])
+    ratio = [stretch["end_horizontal_m"] / stretch["end_sigma_m"] for stretch in ends]
+    p50, p95 = np.percentile(error, (50, 95)).tolist() if ends else (None, None)
+    return {
+        "stretches": len(ends),
+        "length_s": counts.hidden_length_s,
+        "end_horizontal_m": {"p50": p50, "p95": p95, "max": float(error.max()) if ends else None},
+        "end_error_over_sigma_rms": math.sqrt(math.fsum(r * r for r in ratio) / len(ends)) if ends else None,
+        "without_end": len(counts.stretches) - len(ends),
+        "per_stretch": counts.stretches,
     }
 
 
 def _share(part: float, whole: float) -> float:
     """A ratio whose rounding errors do not leave 0..1."""
-    return float(min(part / whole, 1.0))
+    return min(part / whole, 1.0)

@@ -1,9 +1,9 @@
 """Reading the files of a run folder: what is missing, damaged or of another kind is named."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeVar
 
 import msgspec
 
@@ -19,6 +19,8 @@ T = TypeVar("T")
 
 CODES = {"sensor": Sensor, "reason": Reason, "excluded": Excluded}
 """Columns that are numbers in memory and dictionary strings (lower-case names) in Parquet."""
+TEXTS = ("scene", "mode")
+"""Columns that are codes into lists of tags in memory and dictionary strings in Parquet."""
 EXPECTED = "expected a run folder, as egoloc replay writes it"
 
 
@@ -48,6 +50,7 @@ class Manifest(TypedDict):
     """The part of manifest.json that other commands rely on."""
 
     facts: Facts
+    keep: NotRequired[dict[str, Any]]
 
 
 class SeenAxis(TypedDict, total=False):
@@ -113,20 +116,35 @@ def checked(content: dict[str, Any], kind: type[T], path: Path) -> T:
 
 
 def read_table(path: Path, columns: Sequence[str]) -> "pyarrow.Table":
-    """The columns of a table, with checksums verified: numbers, and the known names of CODES."""
+    """The columns of a table, with checksums verified: numbers, the known names of CODES and the texts of TEXTS."""
+    import pyarrow as pa
+
+    groups = list(read_groups(path, columns))
+    return pa.concat_tables([table.unify_dictionaries() for table in groups])
+
+
+def read_groups(path: Path, columns: Sequence[str]) -> Iterator["pyarrow.Table"]:
+    """What ``read_table`` reads, by row groups; one empty table where there are none."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     if not path.is_file():
         raise EgolocError(f"{path}: missing: {EXPECTED}")
     try:
-        missing = [name for name in columns if name not in pq.read_schema(path).names]
-        if missing:
-            raise EgolocError(f"{path}: expected the columns of a run, without: {', '.join(missing)}")
-        table = pq.read_table(path, columns=list(columns), page_checksum_verification=True)
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            missing = [name for name in columns if name not in file.schema_arrow.names]
+            if missing:
+                raise EgolocError(f"{path}: expected the columns of a run, without: {', '.join(missing)}")
+            for group in range(file.num_row_groups):
+                yield _checked_table(file.read_row_group(group, columns=list(columns)), path)
+            if not file.num_row_groups:
+                yield _checked_table(file.read(columns=list(columns)), path)
     except (pa.ArrowException, OSError) as error:
         raise EgolocError(f"{path}: expected a Parquet file: {str(error).splitlines()[0]}") from None
-    for name in columns:
+
+
+def _checked_table(table: "pyarrow.Table", path: Path) -> "pyarrow.Table":
+    for name in table.column_names:
         problem = _problem(name, table[name])
         if problem:
             raise EgolocError(f"{path}: column {name}: {problem}")
@@ -139,13 +157,15 @@ def _problem(name: str, column: "pyarrow.ChunkedArray") -> str:
     import pyarrow.compute as pc
 
     kind = column.type
-    if name not in CODES:
+    if name not in CODES and name not in TEXTS:
         number = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
         if not number:
             return f"expected numbers, got {kind}"
         return "expected stamps, got nulls" if name == "t_ns" and column.null_count else ""
     if not pa.types.is_string(kind.value_type if pa.types.is_dictionary(kind) else kind):
         return f"expected names, got {kind}"
+    if name in TEXTS:
+        return "expected names, got nulls" if column.null_count else ""
     known = {member.name.lower() for member in CODES[name]}
     strange = [value for value in pc.unique(column.cast(pa.string())).to_pylist() if value not in known]
     return f"unknown name {strange[0]!r}" if strange else ""

@@ -1,161 +1,180 @@
-"""metrics.json from the tables of a run: nothing else is needed, so new limits need no new replay."""
+"""From the tables of a run to its sums, batch by batch: nothing else is needed, so new limits need no new replay.
 
+Whatever the batches, the sums are the same to the last bit.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion.result import Reason, Sensor
+from replay.cells import Cells
 from replay.config import Limits
-from replay.metrics import (
-    MIN_EVALUATED_NS,
-    NOT_EVALUATED,
-    Span,
-    cover_ns,
-    evaluated_span,
-    method_metrics,
-    well_known,
-)
+from replay.metrics import well_known
+from replay.outputs import Outputs, Waiting, cover_ns, longest_cover_ns
 from replay.references import Excluded
-from replay.store import Run
+from replay.run_files import Facts
+from replay.segments import AXES, METHODS
+from replay.stretches import Stretches
+from replay.sums import Counts, Sums
 from sensors.clock import NS_PER_S
+from sensors.records import GnssStatus
 
 Floats = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]
-Metrics = dict[str, Any]
 
-END_TOLERANCE_NS = NS_PER_S
-"""The last scored epoch of a hidden stretch must lie this near its end for its error to count as that of the end."""
-METHODS = {"gnss": Sensor.GNSS_POSITION, "egovm": Sensor.POSE_FIX}
-_UNCOUNTED = (Excluded.EVALUATED, Excluded.NOT_HIDDEN)
-
-
-def score(run: Run, limits: Limits) -> Metrics:
-    """The contents of metrics.json."""
-    states, facts = run.states, run.facts
-    evaluated, excluded = _evaluated(states, limits, heading=facts["reference"]["heading"] == "attitude")
-    evaluated[:1] = False  # covers nothing
-    span = evaluated_span(states["t_ns"], evaluated, states["ref_speed"], facts["period_ns"])
-    metrics: Metrics = {
-        "limits": {"lon_m": limits.lon_m, "lat_m": limits.lat_m, "yaw_deg": limits.yaw_deg},
-        "order": facts["order"],
-        "reference": facts["reference"],
-        "span_s": len(states["t_ns"]) * facts["period_ns"] / NS_PER_S,
-        "duration_s": span.total_ns / NS_PER_S,
-        "distance_m": span.total_m,
-        "epochs": int(evaluated.sum()),
-        "excluded": excluded,
-    }
-    if facts["stretches"] is not None:
-        metrics["hidden"] = _hidden(run)
-    metrics["methods"] = _methods(run, evaluated, span, limits)
-    metrics["alignment_s"] = facts["alignment_s"]
-    metrics["decisions"] = _decision_counts(run.decisions)
-    metrics["left_out"] = facts["left_out"]
-    metrics["warnings"] = facts["warnings"]
-    return metrics
+SENSORS = {"gnss": Sensor.GNSS_POSITION, "egovm": Sensor.POSE_FIX}
+STATES = (
+    *("t_ns", "x", "y", "ref_x", "ref_y", "ref_yaw", "ref_speed", "ref_sigma_m", "ref_sigma_yaw", "excluded"),
+    *("err_lon", "err_lat", "err_yaw", "sigma_lon", "sigma_lat", "stretch", "scene", "mode"),
+)
+DECISIONS = (
+    *("t_ns", "sensor", "row", "reason", "accepted", "status"),
+    *("err_lon", "err_lat", "err_yaw", "scene", "mode"),
+)
+"""The columns of both tables that scoring reads."""
+HOLD_NS = 60 * NS_PER_S
+"""A decision may be this much older than another of a batch before."""
+_UNCOUNTED = tuple(why.name.lower() for why in (Excluded.EVALUATED, Excluded.NOT_HIDDEN))
+_ERRORS = ("err_lon", "err_lat", "err_yaw")
 
 
-def _evaluated(states: Columns, limits: Limits, *, heading: bool) -> tuple[NDArray[np.bool_], dict[str, int]]:
-    """Which epochs are scored, and how many are not, by reason."""
-    code = states["excluded"]
-    evaluated = code == Excluded.EVALUATED
-    counts = {why.name.lower(): int((code == why).sum()) for why in Excluded if why not in _UNCOUNTED}
-    sigma = np.stack((states["ref_sigma_m"], states["ref_sigma_yaw"]), axis=-1)
-    position, yaw = well_known(sigma, limits, yaw=heading)
-    counts["position_sigma"] = int((evaluated & ~position).sum())
-    counts["yaw_sigma"] = int((evaluated & position & ~yaw).sum())
-    return evaluated & position & yaw, {reason: count for reason, count in counts.items() if count}
+class Scorer:
+    """Adds up a drive.
 
+    limits: the largest errors; log: its name; period_ns: of the output grid; start_ns: its first IMU sample.
+    """
 
-def _methods(run: Run, evaluated: NDArray[np.bool_], span: Span, limits: Limits) -> Metrics:
-    """One entry a method that has data."""
-    states, hidden = run.states, run.facts["stretches"] is not None
-    present = [name for name, sensor in METHODS.items() if (run.decisions["sensor"] == sensor).any()]
-    present = [name for name in present if not (hidden and name == "gnss")]
-    least: float = MIN_EVALUATED_NS
-    if hidden:
-        least = min(least, *(0.9 * (end - start) for start, end in run.facts["stretches"] or ()))
-    if span.total_ns < max(least, 1):
-        return {name: dict(NOT_EVALUATED) for name in (*present, "fusion")}
-    methods = {name: sensor_metrics(run.decisions, METHODS[name], span, limits) for name in present}
-    weights = span.weights(states["t_ns"], cover_ns(states["t_ns"], run.facts["period_ns"]))
-    time, distance = (np.where(evaluated, weight, 0.0) for weight in weights)
-    methods["fusion"] = method_metrics(_error(states), time, distance, span.total_ns, span.total_m, limits)
-    return methods
+    def __init__(self, limits: Limits, *, log: str, period_ns: int, start_ns: int) -> None:
+        self._limits, self._log, self._period_ns = limits, log, period_ns
+        self._cells = Cells(limits, start_ns)
+        self._waiting = {method: Waiting() for method in SENSORS}
+        self._stretches = Stretches()
+        self._grid = Outputs(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
+        self._speed = np.empty(0)
+        self._before_ns: int | None = None
+        self._seen_ns = -(2**62)
+        self._rows = 0
+        self._excluded = dict.fromkeys((*(why.name.lower() for why in Excluded), "position_sigma", "yaw_sigma"), 0)
+        self._decisions = np.zeros((len(Sensor), len(Reason)), np.int64)
 
+    def add(self, states: Columns, decisions: Columns) -> None:
+        """The next rows of both tables, in time order; either may be empty, or ahead of the other.
 
-def sensor_metrics(decisions: Columns, sensor: Sensor, span: Span, limits: Limits) -> Metrics:
-    """A sensor at its own stamps: each fix once, whatever the filter decided, if it has a position."""
-    rows = np.flatnonzero((decisions["sensor"] == sensor) & (decisions["status"] != 0))
-    rows = rows[np.unique(decisions["row"][rows], return_index=True)[1]]
-    rows = rows[np.argsort(decisions["t_ns"][rows], kind="stable")]
-    t_ns = decisions["t_ns"][rows]
-    error = _error({name: decisions[name][rows] for name in ("err_lon", "err_lat", "err_yaw")})
-    time, distance = span.weights(t_ns, cover_ns(t_ns))
-    unknown = np.isnan(error[:, 0])  # no reference at the fix itself, though there is at part of the time it covers
-    total_ns, total_m = span.total_ns - time[unknown].sum(), span.total_m - distance[unknown].sum()
-    return method_metrics(error, time, distance, float(total_ns), float(total_m), limits)
+        scene and mode: codes into lists of texts that only ever grow.
+        """
+        self._add_states(states)
+        self._add_decisions(decisions)
+        if self._before_ns is not None:
+            self._sum_fixes(self._before_ns)
+        self._stretches.add(states, decisions, self._seen_ns)
+        needed = min(waiting.needs_after_ns(self._seen_ns - HOLD_NS) for waiting in self._waiting.values())
+        self._grid, self._speed = _rows(self._grid, self._grid.t_ns > needed), self._speed[self._grid.t_ns > needed]
 
+    def finish(self, facts: Facts, scenes: Sequence[str] = ("",), modes: Sequence[str] = ("",)) -> Sums:
+        """The sums of the whole drive. scenes, modes: the texts of the codes."""
+        self._sum_fixes(None)
+        hidden = facts["stretches"] is not None
+        present = [name for name, sensor in SENSORS.items() if self._decisions[sensor].any()]
+        methods = [*(name for name in present if not (hidden and name == "gnss")), "fusion"]
+        texts = {"log": (self._log,), "scene": tuple(scenes), "mode": tuple(modes), "method": METHODS}
+        sketch = self._cells.histograms.sketch(lambda key: _named(key, scenes, modes), methods)
+        return Sums(self._counts(facts), self._cells.table(methods, texts), sketch)
 
-def _hidden(run: Run) -> Metrics:
-    """How far the filter had drifted at the end of every stretch without GNSS."""
-    hide, planned = run.facts["hide_gnss"], run.facts["stretches"]
-    assert hide is not None
-    assert planned is not None
-    stretches = [_stretch(run, index, start, end) for index, (start, end) in enumerate(planned)]
-    ends = [s for s in stretches if s["end_horizontal_m"] is not None]
-    error = np.array([s["end_horizontal_m"] for s in ends])
-    ratio = np.array([s["end_horizontal_m"] / s["end_sigma_m"] for s in ends])
-    p50, p95 = np.percentile(error, (50, 95)).tolist() if ends else (None, None)
-    return {
-        "stretches": len(ends),
-        "length_s": hide["length_s"],
-        "end_horizontal_m": {"p50": p50, "p95": p95, "max": float(error.max()) if ends else None},
-        "end_error_over_sigma_rms": float(np.sqrt(np.mean(ratio**2))) if ends else None,
-        "without_end": len(stretches) - len(ends),
-        "per_stretch": stretches,
-    }
+    def _add_states(self, states: Columns) -> None:
+        """Sum the grid and fusion's states on it, and keep the grid for the fixes that are still to come."""
+        t_ns = states["t_ns"]
+        if not len(t_ns):
+            return
+        evaluated = self._evaluated(states)
+        if self._before_ns is None:
+            evaluated[0] = False  # stands for nothing
+        cover = cover_ns(t_ns, longest_cover_ns(self._period_ns), self._before_ns)
+        cell = self._cells.find(t_ns, states["scene"], states["mode"])
+        every = Outputs(t_ns, cover, cell, _error(states))
+        grid, speed = _rows(every, evaluated), states["ref_speed"][evaluated]
+        speed = np.where(np.isfinite(speed), speed, 0.0)
+        self._cells.add_grid(grid.cell, grid.cover_ns, speed)
+        with_output = np.isfinite(every.error[:, 0]) & np.isfinite(every.error[:, 1])
+        self._cells.add_outputs("fusion", _rows(every, with_output), grid, speed)
+        self._grid, self._speed = _after(self._grid, grid), np.concatenate((self._speed, speed))
+        self._before_ns, self._rows = int(t_ns[-1]), self._rows + len(t_ns)
 
+    def _evaluated(self, states: Columns) -> NDArray[np.bool_]:
+        """Which epochs are scored; the others are counted by reason."""
+        code = states["excluded"]
+        evaluated: NDArray[np.bool_] = code == Excluded.EVALUATED
+        for why in Excluded:
+            self._excluded[why.name.lower()] += int((code == why).sum())
+        sigma = np.stack((states["ref_sigma_m"], states["ref_sigma_yaw"]), axis=-1)
+        position, yaw = well_known(sigma, self._limits, heading=np.isfinite(states["ref_yaw"]))
+        self._excluded["position_sigma"] += int((evaluated & ~position).sum())
+        self._excluded["yaw_sigma"] += int((evaluated & position & ~yaw).sum())
+        chosen: NDArray[np.bool_] = evaluated & position & yaw
+        return chosen
 
-def _stretch(run: Run, index: int, start: int, end: int) -> Metrics:
-    """One stretch: start since the log's, horizontal error and sigma at its last epoch that has both."""
-    states = run.states
-    known = [np.isfinite(states[name]) for name in ("ref_x", "x", "y", "sigma_lon", "sigma_lat")]
-    rows = np.flatnonzero((states["stretch"] == index) & np.all(known, axis=0))
-    found = len(rows) > 0 and end - states["t_ns"][rows[-1]] <= END_TOLERANCE_NS
-    entry: Metrics = {
-        "start_s": (start - run.facts["start_ns"]) / NS_PER_S,
-        "end_horizontal_m": None,
-        "end_sigma_m": None,
-    }
-    if found:
-        last = rows[-1]
-        entry["end_horizontal_m"] = float(
-            np.hypot(*(states[axis][last] - states[f"ref_{axis}"][last] for axis in "xy"))
+    def _add_decisions(self, decisions: Columns) -> None:
+        """Count what the filter decided, and line up the fixes: each once, whatever it decided, with a position."""
+        if not len(decisions["t_ns"]):
+            return
+        self._seen_ns = max(self._seen_ns, int(decisions["t_ns"].max()))
+        pairs = decisions["sensor"].astype(np.int64) * len(Reason) + decisions["reason"]
+        self._decisions += np.bincount(pairs, minlength=self._decisions.size).reshape(self._decisions.shape)
+        for method, sensor in SENSORS.items():
+            rows = np.flatnonzero((decisions["sensor"] == sensor) & (decisions["status"] != GnssStatus.NONE))
+            fixes = {name: decisions[name][rows] for name in ("t_ns", "row", "scene", "mode", *_ERRORS)}
+            cell = self._cells.find(fixes["t_ns"], fixes["scene"], fixes["mode"])
+            self._waiting[method].add(fixes["t_ns"], fixes["row"], cell, _error(fixes))
+
+    def _sum_fixes(self, upto_ns: int | None) -> None:
+        for method, waiting in self._waiting.items():
+            self._cells.add_outputs(method, waiting.take(upto_ns), self._grid, self._speed)
+
+    def _counts(self, facts: Facts) -> Counts:
+        hide, planned = facts["hide_gnss"], facts["stretches"]
+        return Counts(
+            limits=self._limits,
+            order=facts["order"],
+            reference=facts["reference"],
+            span_ns=self._rows * self._period_ns,
+            alignment_s=facts["alignment_s"],
+            excluded={why: count for why, count in self._excluded.items() if count and why not in _UNCOUNTED},
+            decisions=self._decision_counts(),
+            hidden_length_s=None if planned is None or hide is None else hide["length_s"],
+            stretches=self._stretches.entries(planned or [], facts["start_ns"]),
+            warnings=facts["warnings"],
+            warning_counts=dict(Counter(entry["kind"] for entry in facts["warnings"])),
+            left_out=facts["left_out"],
         )
-        entry["end_sigma_m"] = float(np.hypot(states["sigma_lon"][last], states["sigma_lat"][last]))
-    entry["since_gnss_s"] = _since_gnss(run.decisions, int(states["t_ns"][rows[-1]])) if found else None
-    return entry
 
-
-def _since_gnss(decisions: Columns, t_ns: int) -> float | None:
-    """Seconds since the last GNSS position that the filter applied."""
-    used = (decisions["sensor"] == Sensor.GNSS_POSITION) & decisions["accepted"] & (decisions["t_ns"] <= t_ns)
-    return (t_ns - int(decisions["t_ns"][used].max())) / NS_PER_S if used.any() else None
-
-
-def _decision_counts(decisions: Columns) -> dict[str, dict[str, int]]:
-    """Sensor -> reason -> number of measurements."""
-    counts: dict[str, dict[str, int]] = {}
-    for sensor in Sensor:
-        reasons = np.bincount(decisions["reason"][decisions["sensor"] == sensor], minlength=len(Reason))
-        if reasons.any():
-            counts[sensor.name.lower()] = {
-                reason.name.lower(): int(n) for reason, n in zip(Reason, reasons, strict=True) if n
-            }
-    return counts
+    def _decision_counts(self) -> dict[str, dict[str, int]]:
+        """Sensor -> reason -> number of measurements."""
+        counts = {}
+        for sensor in Sensor:
+            found = {reason.name.lower(): int(self._decisions[sensor, reason]) for reason in Reason}
+            if any(found.values()):
+                counts[sensor.name.lower()] = {reason: count for reason, count in found.items() if count}
+        return counts
 
 
 def _error(columns: Columns) -> Floats:
-    return np.stack([columns[name] for name in ("err_lon", "err_lat", "err_yaw")], axis=-1)
+    """(N, 3) m, m, deg."""
+    lon, lat, yaw = (columns[name] for name in _ERRORS)
+    return np.stack((lon, lat, np.degrees(yaw)), axis=-1)
+
+
+def _rows(outputs: Outputs, chosen: NDArray[np.bool_]) -> Outputs:
+    return Outputs(outputs.t_ns[chosen], outputs.cover_ns[chosen], outputs.cell[chosen], outputs.error[chosen])
+
+
+def _after(first: Outputs, then: Outputs) -> Outputs:
+    return Outputs(*(np.concatenate((getattr(first, f.name), getattr(then, f.name))) for f in fields(Outputs)))
+
+
+def _named(key: Any, scenes: Sequence[str], modes: Sequence[str]) -> tuple[str, str, str, str]:
+    scene, mode, method, axis = key
+    return scenes[scene], modes[mode], METHODS[method], AXES[axis]

@@ -3,68 +3,89 @@
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
+import msgspec
 
-from replay.run_files import CODES, EXPECTED, Facts, Manifest, checked, read_json, read_table
+from replay.run_files import EXPECTED, Facts, Manifest, checked, read_json
+from sensors.bounds import NonNegative
 from sensors.errors import EgolocError
 
-if TYPE_CHECKING:
-    import pyarrow
-
-Columns = dict[str, NDArray[Any]]
-
-FILES = {"config.toml", "manifest.json", "metrics.json", "states.parquet", "decisions.parquet", "report.html"}
-STATES = (
-    *("t_ns", "x", "y", "ref_x", "ref_y", "ref_speed", "ref_sigma_m", "ref_sigma_yaw", "excluded"),
-    *("err_lon", "err_lat", "err_yaw", "sigma_lon", "sigma_lat", "stretch"),
-)
-DECISIONS = ("t_ns", "sensor", "row", "reason", "accepted", "status", "err_lon", "err_lat", "err_yaw")
-"""The columns of both tables that scoring reads."""
+FILES = {
+    *("config.toml", "manifest.json", "metrics.json", "states.parquet", "decisions.parquet"),
+    *("segments.parquet", "percentiles.parquet", "report.html"),
+}
+"""What may stand in a run folder, besides recordings."""
 VERSIONED = ("egoloc", "numpy", "numba", "scipy", "pyarrow", "pymap3d", "pyproj", "mcap")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Run:
-    """A replay before scoring: the columns of both tables, and facts that scoring needs (kept in manifest.json)."""
+class StorageError(EgolocError):
+    """A run folder cannot be written: the disk is full, gone or read-only. Nothing is wrong with the log."""
 
-    states: Columns
-    decisions: Columns
-    facts: Facts
+
+class Keep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What of a replay's tables is written; everything is scored first."""
+
+    states_hz: NonNegative | None = None
+    """States on multiples of 1/states_hz s of Unix time, 1/s; None: all, 0: none."""
+    decisions: Literal["all", "rejected", "none"] = "all"
+    """rejected: measurements that were not applied."""
+
+    @property
+    def everything(self) -> bool:
+        """Whether the run can be scored again."""
+        return self.states_hz is None and self.decisions == "all"
+
+
+@contextmanager
+def storage(out: Path) -> Iterator[None]:
+    """What the system says against writing `out` in the block, as StorageError."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{out}: cannot be written: {_reason(error)}") from None
 
 
 @contextmanager
 def new_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary folder that becomes `out` when the block ends well and vanishes when it does not.
 
-    Only a run folder is ever overwritten.
+    Only a run folder is ever overwritten. Raises StorageError for any OSError.
     """
     check_free(out, overwrite=overwrite)
+    above = [parent for parent in out.absolute().parents if not parent.exists()]
     temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
-        temporary.mkdir(parents=True)
-        yield temporary
-        if out.exists():
-            old = out.with_name(f".{out.name}.{os.getpid()}.old")
-            out.rename(old)
-            temporary.rename(out)
-            shutil.rmtree(old)
-        else:
-            temporary.rename(out)
-    except OSError as error:
-        raise EgolocError(f"{out}: cannot be written: {_reason(error)}") from None
+        with storage(out):
+            temporary.mkdir(parents=True)
+            yield temporary
+            if out.exists():
+                old = out.with_name(f".{out.name}.{os.getpid()}.old")
+                out.rename(old)
+                temporary.rename(out)
+                shutil.rmtree(old)
+            else:
+                temporary.rename(out)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        with suppress(OSError):  # all that hold nothing
+            for folder in above:
+                folder.rmdir()
+
+
+def clear_leftovers(out: Path) -> None:
+    """Remove what a process that died has left of writing `out`; none may be at it now."""
+    leftover = re.compile(rf"\.{re.escape(out.name)}\.\d+\.(tmp|old)")
+    for path in out.parent.iterdir() if out.parent.is_dir() else ():
+        if leftover.fullmatch(path.name):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _reason(error: OSError) -> str:
@@ -93,17 +114,6 @@ def _check_place(out: Path) -> None:
         raise EgolocError(f"{out}: cannot be written: no permission to write in {above}")
 
 
-def write_tables(folder: Path, run: Run) -> None:
-    """states.parquet and decisions.parquet, side by side."""
-    with ThreadPoolExecutor(2) as pool:
-        tasks = [
-            pool.submit(_write_parquet, folder / f"{name}.parquet", columns)
-            for name, columns in (("states", run.states), ("decisions", run.decisions))
-        ]
-        for task in tasks:
-            task.result()
-
-
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """JSON with NaN refused, replaced at once if the file exists."""
     temporary = path.with_name(f".{path.name}.tmp")
@@ -115,17 +125,17 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
             temporary.unlink(missing_ok=True)
 
 
-def load_run(folder: Path) -> Run:
-    """The run in a folder, with the columns that scoring needs."""
+def load_facts(folder: Path) -> Facts:
+    """What scoring must know of a run besides its tables. Raises EgolocError unless these are whole."""
     if not folder.is_dir():
         raise EgolocError(f"{folder}: {EXPECTED}")
     path = folder / "manifest.json"
-    facts = checked(read_json(path), Manifest, path)["facts"]
-    states, decisions = (
-        _arrays(read_table(folder / f"{name}.parquet", columns))
-        for name, columns in (("states", STATES), ("decisions", DECISIONS))
-    )
-    return Run(states, decisions, facts)
+    manifest = checked(read_json(path), Manifest, path)
+    if not checked(manifest.get("keep", {}), Keep, path).everything:
+        raise EgolocError(
+            f"{folder}: cannot be scored again, its tables were thinned (--states-hz, --decisions): replay the log"
+        )
+    return manifest["facts"]
 
 
 def versions() -> dict[str, str]:
@@ -145,43 +155,3 @@ def file_hash(path: Path) -> str:
         raise EgolocError(f"{path}: expected a file")
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _write_parquet(path: Path, columns: Columns) -> None:
-    import pyarrow.parquet as pq
-
-    table = _arrow_table(columns)
-    names = [name for name in columns if name in CODES]
-    options = {"compression": "lz4", "write_statistics": False, "write_page_checksum": True}
-    pq.write_table(table, path, use_dictionary=names, **options)
-
-
-def _arrow_table(columns: Columns) -> "pyarrow.Table":
-    import pyarrow as pa
-
-    arrays = {}
-    for name, column in columns.items():
-        if name in CODES:
-            names = pa.array([member.name.lower() for member in CODES[name]])
-            arrays[name] = pa.DictionaryArray.from_arrays(pa.array(column.astype(np.int8)), names)
-        elif column.ndim == 2:
-            flat = pa.array(np.ascontiguousarray(column).ravel())
-            arrays[name] = pa.FixedSizeListArray.from_arrays(flat, column.shape[1])
-        else:
-            arrays[name] = pa.array(np.ascontiguousarray(column))
-    return pa.table(arrays)
-
-
-def _arrays(table: "pyarrow.Table") -> Columns:
-    """Every column as an array; dictionary strings as codes again."""
-    return {name: _codes(name, table[name]) if name in CODES else table[name].to_numpy() for name in table.column_names}
-
-
-def _codes(name: str, column: Any) -> NDArray[np.int8]:
-    import pyarrow as pa
-
-    codes = {member.name.lower(): member.value for member in CODES[name]}
-    whole = column.cast(pa.string()).dictionary_encode().combine_chunks()
-    whole = pa.concat_arrays(whole.chunks) if isinstance(whole, pa.ChunkedArray) else whole
-    numbers = np.array([codes[text] for text in whole.dictionary.to_pylist()], np.int8)
-    return numbers[whole.indices.to_numpy(zero_copy_only=False)] if len(whole) else np.empty(0, np.int8)

@@ -8,7 +8,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from replay.metrics import THRESHOLDS
+from replay.segments import AXES, THRESHOLDS
 
 Metrics = Mapping[str, Any]
 
@@ -16,10 +16,14 @@ WIDE = 120
 """Columns from which everything stands in one table."""
 PLAIN_WIDTH = 132
 """Columns taken where the output is no terminal."""
-AXES = {"lon": "lon m", "lat": "lat m", "yaw": "yaw deg"}
+UNITS = {"lon": "lon m", "lat": "lat m", "yaw": "yaw deg"}
 DASH = "-"
 MANY = 1000.0
 """Numbers from here on are written with an exponent, so that no column is cut off."""
+MOST_STRETCHES = 40
+"""Tables of hidden stretches that are longer than this are left to metrics.json."""
+MOST_EXAMPLES = 3
+"""Warnings of a kind that are printed of a campaign."""
 
 METHOD_NAMES = {"gnss": "GNSS-RTK", "egovm": "EgoVM", "fusion": "Fusion"}
 
@@ -46,15 +50,28 @@ def output_console() -> Console:
 
 
 def render(metrics: Metrics, width: int) -> RenderableType:
-    """Methods side by side, hidden stretches if any, then warnings and notes."""
+    """Methods side by side, hidden stretches and slices if any, then warnings and notes."""
     groups = [("lon", "lat", "yaw")] if width >= WIDE else [("lon", "lat"), ("yaw",)]
     parts: list[RenderableType] = []
     for axes in groups:
         parts += [_method_table(metrics, axes, gap=2 if width >= WIDE else 1), ""]
-    if "hidden" in metrics:
+    if "hidden" in metrics and len(metrics["hidden"]["per_stretch"]) <= MOST_STRETCHES:
         parts += [_stretch_table(metrics["hidden"]), ""]
-    warnings = [Text(f"WARNING: {entry['text']}", style="bold red") for entry in metrics["warnings"]]
+    if metrics["slices"]:
+        parts += [_slice_table(metrics["slices"], wide=width >= WIDE), ""]
+    warnings = [Text(f"WARNING: {text}", style="bold red") for text in _warnings(metrics)]
     return Group(*parts, *warnings, *(Text(note) for note in notes(metrics)))
+
+
+def _warnings(metrics: Metrics) -> Iterator[str]:
+    """One line each; of a campaign, how many logs a kind concerns, and examples."""
+    if "logs" not in metrics:
+        yield from (entry["text"] for entry in metrics["warnings"])
+        return
+    for kind, count in metrics["warning_counts"].items():
+        yield f"{kind.replace('_', ' ')}: {count} of {metrics['logs']['done']} logs"
+        examples = [entry for entry in metrics["warnings"] if entry["kind"] == kind]
+        yield from (f"  {entry['log']}: {entry['text']}" for entry in examples[:MOST_EXAMPLES])
 
 
 def notes(metrics: Metrics) -> Iterator[str]:
@@ -64,12 +81,15 @@ def notes(metrics: Metrics) -> Iterator[str]:
         f"AR: share of time with errors below {limits['lon_m']:g} m longitudinal, {limits['lat_m']:g} m lateral, "
         f"{limits['yaw_deg']:g} deg yaw; cov: share of time with output; all in %."
     )
+    if "logs" in metrics:
+        yield _logs(metrics["logs"])
     yield _scored(metrics)
     yield from _unestimated(metrics)
     if "hidden" in metrics:
         yield from _drift(metrics["hidden"])
     if metrics["alignment_s"] is not None:  # else a warning says so
-        yield f"Aligned {metrics['alignment_s']:.1f} s after the first IMU sample."
+        within = ", the slowest log" if "logs" in metrics else ""
+        yield f"Aligned {metrics['alignment_s']:.1f} s after the first IMU sample{within}."
     for reason, count in metrics["excluded"].items() if metrics["reference"]["kind"] else ():
         yield f"Excluded: {count} epochs: {EXCLUDED_TEXT[reason]}."
     for entry in metrics["left_out"]:
@@ -82,36 +102,66 @@ def notes(metrics: Metrics) -> Iterator[str]:
 
 def _method_table(metrics: Metrics, axes: tuple[str, ...], gap: int) -> Table:
     first = axes[0] == "lon"
-    table = _bare_table(gap)
+    table = bare_table(gap)
     table.add_column("\nmethod", no_wrap=True)
     for header in ("\nAR", "\ncov") if first else ():
         table.add_column(header, justify="right", no_wrap=True)
     for axis in axes:
-        for header in _axis_headers(axis):
+        for header in axis_headers(axis):
             table.add_column(header, justify="right", no_wrap=True)
     for name, method in metrics["methods"].items():
-        shares = [_percent(method["ar"], 2), _percent(method["coverage"])] if first else []
-        cells = [cell for axis in axes for cell in _axis_cells(method[axis])]
+        shares = [percent(method["ar"], 2), percent(method["coverage"])] if first else []
+        cells = [cell for axis in axes for cell in axis_cells(method[axis])]
         table.add_row(METHOD_NAMES.get(name, name), *shares, *cells)
     return table
 
 
-def _bare_table(gap: int) -> Table:
+def bare_table(gap: int) -> Table:
     """A table with one line below its head and gap (1 or more) blanks between columns."""
     return Table(box=box.SIMPLE_HEAD, padding=(0, gap - 1, 0, 0), pad_edge=False, show_edge=False, header_style="bold")
 
 
-def _axis_headers(axis: str) -> list[str]:
-    return [f"{AXES[axis]}\nMAE", "\nRMSE", *(f"%\n<{threshold:g}" for threshold in THRESHOLDS[axis])]
+def axis_headers(axis: str) -> list[str]:
+    return [f"{UNITS[axis]}\nMAE", "\nRMSE", *(f"%\n<{threshold:g}" for threshold in THRESHOLDS[axis])]
 
 
-def _axis_cells(axis: Metrics | None) -> list[str]:
+def axis_cells(axis: Metrics | None, digits: int = 1) -> list[str]:
+    """MAE, RMSE and the shares below the thresholds, in % with so many digits."""
     if axis is None:
         return [DASH] * 5
-    return [_number(axis["mae"], 3), _number(axis["rmse"], 3), *(_percent(share) for share in axis["below"].values())]
+    return [
+        number(axis["mae"], 3),
+        number(axis["rmse"], 3),
+        *(percent(share, digits) for share in axis["below"].values()),
+    ]
 
 
-def _percent(share: float | None, digits: int = 1) -> str:
+def _slice_table(slices: Metrics, *, wide: bool) -> Table:
+    """Exposure and figures by scene tag and by drive mode; without RMSE where it is narrow."""
+    table = bare_table(2 if wide else 1)
+    for header in ("\nslice", "\nmethod"):
+        table.add_column(header, no_wrap=True)
+    errors = [(axis, figure) for axis in AXES for figure in (("mae", "rmse") if wide else ("mae",))]
+    headers = [f"{UNITS[axis] if figure == 'mae' else ''}\n{figure.upper()}" for axis, figure in errors]
+    for header in ("\nh", "\nkm", "\nAR", "\ncov", *headers):
+        table.add_column(header, justify="right", no_wrap=True)
+    for kind, tags in slices.items():
+        for tag, part in tags.items():
+            exposure = (f"{part['hours']:.2f}", f"{part['km']:.1f}")
+            for i, (name, method) in enumerate(part["methods"].items()):
+                first = (tag if kind == "scene" else f"{kind}: {tag}", exposure) if i == 0 else ("", ("", ""))
+                cells = [number(method[axis] and method[axis][figure], 3) for axis, figure in errors]
+                shares = (percent(method["ar"], 2), percent(method["coverage"]))
+                table.add_row(first[0], METHOD_NAMES.get(name, name), *first[1], *shares, *cells)
+    return table
+
+
+def _logs(logs: Metrics) -> str:
+    failed = f"; {len(logs['failed'])} failed and are not in these figures" if logs["failed"] else ""
+    return f"Logs: {logs['done']} of {logs['total']}{failed}."
+
+
+def percent(share: float | None, digits: int = 1) -> str:
     """Per cent; only the whole is printed as 100."""
     if share is None:
         return DASH
@@ -120,17 +170,17 @@ def _percent(share: float | None, digits: int = 1) -> str:
 
 def _stretch_table(hidden: Metrics) -> Table:
     """Every stretch without GNSS: when, and how far off at its end."""
-    table = _bare_table(2)
+    table = bare_table(2)
     for header in ("hidden from\ns", "end error\nm", "sigma\nm", "error/\nsigma", "since GNSS\ns"):
         table.add_column(header, justify="right", no_wrap=True)
     for entry in hidden["per_stretch"]:
         error, sigma, since = entry["end_horizontal_m"], entry["end_sigma_m"], entry["since_gnss_s"]
-        ratio = DASH if error is None else _number(error / sigma, 2)
-        table.add_row(f"{entry['start_s']:.1f}", _number(error, 3), _number(sigma, 3), ratio, _number(since, 1))
+        ratio = DASH if error is None else number(error / sigma, 2)
+        table.add_row(f"{entry['start_s']:.1f}", number(error, 3), number(sigma, 3), ratio, number(since, 1))
     return table
 
 
-def _number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int) -> str:
     """Fixed digits as long as the column holds them."""
     if value is None:
         return DASH
@@ -142,12 +192,20 @@ def _scored(metrics: Metrics) -> str:
     if reference["kind"] is None:
         return "Not evaluated: the log has no reference (see --reference and --hide-gnss)."
     heading = "" if reference["heading"] == "attitude" else ", which has no heading: axes from its course"
-    amount = f"{metrics['epochs']} epochs, {metrics['duration_s']:.1f} s, {metrics['distance_m'] / 1000:.3f} km"
+    amount = _amount(metrics)
     against = f"against {reference['kind']}{heading}"
     if all(method["ar"] is None for method in metrics["methods"].values()):
         return f"Not evaluated: too little reference: {amount} {against}."
     where = ", at the antenna in the hidden stretches" if "hidden" in metrics else ""
     return f"Scored: {amount} {against}{where}; the filter's state at each time, in {metrics['order']} order."
+
+
+def _amount(metrics: Metrics) -> str:
+    """How much was scored; hours once it is more than one."""
+    seconds, km = metrics["duration_s"], metrics["distance_m"] / 1000
+    if seconds < 3600:
+        return f"{metrics['epochs']} epochs, {seconds:.1f} s, {km:.3f} km"
+    return f"{metrics['epochs']:,} epochs, {seconds / 3600:,.2f} h, {km:,.1f} km"
 
 
 def _unestimated(metrics: Metrics) -> Iterator[str]:
@@ -174,7 +232,7 @@ def _drift(hidden: Metrics) -> Iterator[str]:
 
 def bench_table(result: Metrics) -> Table:
     """A benchmark's rows, how many times a peer egoloc makes, and the other ratios on lines of their own."""
-    table = _bare_table(2)
+    table = bare_table(2)
     table.add_column("name")
     table.add_column("metric")
     for header in ("median", "min", "max", "ratio"):

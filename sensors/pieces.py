@@ -40,14 +40,20 @@ def cut(log: Log, length_s: float = PIECE_S) -> Iterator[Log]:
 def join(pieces: Iterable[Log]) -> Log:
     """The whole drive."""
     given = list(pieces)
+    if len(given) == 1:
+        return given[0]
     parts = {name: [r for piece in given if (r := getattr(piece, name)) is not None] for name in SENSORS}
-    whole: dict[str, Any] = {name: _joined(records) if records else None for name, records in parts.items()}
-    counts: Counter[tuple[str, str]] = Counter()
-    for piece in given:
-        for entry in piece.left_out:
-            counts[entry.source, entry.reason] += entry.count
-    left_out = tuple(LeftOut(source, reason, count) for (source, reason), count in counts.items())
+    whole: dict[str, Any] = {name: joined(records) if records else None for name, records in parts.items()}
+    left_out = summed(entry for piece in given for entry in piece.left_out)
     return replace(given[0], **whole, left_out=left_out) if given else Log()
+
+
+def summed(left_out: Iterable[LeftOut]) -> tuple[LeftOut, ...]:
+    """One entry for each source and reason."""
+    counts: Counter[tuple[str, str]] = Counter()
+    for entry in left_out:
+        counts[entry.source, entry.reason] += entry.count
+    return tuple(LeftOut(source, reason, count) for (source, reason), count in counts.items())
 
 
 def _between(record: Any, begin: int, end: int) -> Any:
@@ -55,7 +61,8 @@ def _between(record: Any, begin: int, end: int) -> Any:
     return record[first:last]
 
 
-def _joined(records: list[Any]) -> Any:
+def joined(records: list[Any]) -> Any:
+    """Records of one kind that follow each other as one."""
     if len(records) == 1:
         return records[0]
     columns = {f.name: np.concatenate([getattr(r, f.name) for r in records]) for f in fields(records[0])}

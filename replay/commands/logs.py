@@ -1,5 +1,6 @@
 """egoloc convert, simulate and info: making logs and looking into them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,9 @@ from sensors.errors import EgolocError
 
 if TYPE_CHECKING:  # records bring numpy along
     from sensors.records import Log
+
+LONGEST_KM = 1e6
+"""Of a simulated drive."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Convert:
                 from replay.harness import with_reference
 
                 log = with_reference(log, self.reference, log.map_frame)
-        _write(log, self.log, as_json=self.json)
+        _write((log,), self.log, "writing", as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -51,13 +55,15 @@ class Simulate:
     """Write a simulated drive as an MCAP log."""
 
     scenario: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENARIO")]
-    """A scenario of the package (demo, clean) or a TOML file with one."""
+    """A scenario of the package (demo, clean, road-test) or a TOML file with one."""
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
     """The log to write; it must not exist yet."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Seed of everything random; default: the scenario's."""
     duration_s: Annotated[float | None, tyro.conf.arg(metavar="S")] = None
     """Length of the drive, s; default: the scenario's."""
+    length_km: Annotated[float | None, tyro.conf.arg(metavar="KM")] = None
+    """Length of the drive, km; with a duration as well, what ends first."""
     overwrite: bool = False
     """Replace DEST.mcap."""
     json: bool = False
@@ -65,16 +71,17 @@ class Simulate:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Simulate, write, and say what was written."""
-        from sensors.simulate.drive import simulate
+        from replay.sources import as_long_as
+        from sensors.simulate.drive import simulate_pieces
         from sensors.simulate.scenarios import load
 
         _check_new(self.log, overwrite=self.overwrite)
-        scenario = load(self.scenario)
-        duration_s = scenario.duration_s if self.duration_s is None else self.duration_s
+        if self.length_km is not None and not 0 < self.length_km <= LONGEST_KM:
+            raise EgolocError(f"--length-km: expected more than 0 and at most {LONGEST_KM:g}, got {self.length_km:g}")
+        scenario = as_long_as(load(self.scenario), self.length_km, self.duration_s)
         seed = scenario.seed if self.seed is None else self.seed
-        with stage(f"simulating {duration_s:g} s of driving"):
-            log = simulate(duration_s, seed, scenario)
-        _write(log, self.log, as_json=self.json)
+        pieces = simulate_pieces(scenario.duration_s, seed, scenario)
+        _write(pieces, self.log, "simulating", as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -102,14 +109,15 @@ class Info:
             print_inventory(found)
 
 
-def _write(log: "Log", path: Path, *, as_json: bool) -> None:
-    """Write a log and say what it holds."""
-    from replay.inventory import inventory, print_inventory
+def _write(pieces: "Iterable[Log]", path: Path, doing: str, *, as_json: bool) -> None:
+    """Write the pieces of a drive as they come, and say what it holds."""
+    from replay.inventory import Inventory, print_inventory
     from sensors.mcap.io import write_log
 
-    with stage(f"writing {path}"):
-        write_log(path, log)
-    found = inventory(log, str(path))
+    held = Inventory()
+    with stage(f"{doing} {path}"):
+        write_log(path, held.watch(pieces))
+    found = held.found(str(path))
     if as_json:
         print_json(found)
     else:

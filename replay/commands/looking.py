@@ -8,6 +8,10 @@ from typing import Annotated, Literal
 import tyro
 
 from replay.commands.output import print_json, stage
+from sensors.errors import EgolocError
+
+SHOWN = 10
+"""Logs of a campaign that a message names."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,8 @@ class View:
         """Write the recording and open it where there is a display."""
         from replay.viewer import open_viewer, write_recording
 
+        for folder in filter(None, (self.folder, self.other)):
+            check_no_campaign(folder)
         with stage("drawing"):
             rrd = write_recording(self.folder, self.rrd, self.other)
         print(f"Recording: {rrd}")
@@ -63,3 +69,17 @@ class Bench:
         from replay.table import bench_table, output_console
 
         output_console().print(bench_table(result))
+
+
+def check_no_campaign(folder: Path) -> None:
+    """Raise where a folder holds the runs of several logs."""
+    from replay.campaign_folder import is_campaign, log_names
+
+    if not is_campaign(folder):
+        return
+    names = [name for name in log_names(folder) if (folder / name).is_dir()]
+    if not names:
+        raise EgolocError(f"{folder}: expected the run of one log, got a campaign without any finished log")
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    shown = ", ".join(names[:SHOWN])
+    raise EgolocError(f"{folder}: expected the run of one log, as in {folder / names[0]}; there are {shown}{more}")

@@ -1,31 +1,33 @@
-"""egoloc replay, score and demo."""
+"""egoloc replay."""
 
-import sys
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import tyro
 
-from replay.commands.output import print_json, stage
+from replay.commands.output import print_json, show, show_campaign, stage
 from sensors.errors import EgolocError
 
 if TYPE_CHECKING:
+    from replay.batch import Job
     from replay.config import RunConfig
+    from replay.sources import LogSource
 
 
 @dataclass(frozen=True)
 class Replay:
-    """Run a log through the filter and score it against its reference.
+    """Run logs through the filter and score them against their references.
 
-    Writes a run folder: config.toml, manifest.json, metrics.json, states.parquet and decisions.parquet.
+    Writes a run folder: config.toml, manifest.json, metrics.json and Parquet tables. Of several logs, a run folder each
+    and the metrics of all; a log that fails is told at the end, and the exit code is 1.
     """
 
-    logs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="LOG [LOG ...]")]
-    """MCAP logs. One log becomes the run folder RUN, several become RUN/<name of the log> each."""
+    logs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="LOG [LOG ...]")]
+    """MCAP logs, or drives that are simulated on the way: scenario:NAME[,drives=N][,seed=S][,length_km=L]
+    [,duration_s=T][,network=K]. One log becomes the run folder RUN, several become RUN/<name of the log> each."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
     """The run folder to write; it must not exist yet."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
@@ -38,30 +40,45 @@ class Replay:
     hide_gnss: Annotated[str | None, tyro.conf.arg(metavar="EVERY:LENGTH")] = None
     """Hide GNSS for LENGTH seconds every EVERY seconds and score against the hidden RTK-fixed fixes, as in 60:15.
     The first stretch starts EVERY seconds after the first fix; one that the log's end cuts off is not used."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Logs replayed at a time, each in a process of its own; default: as many as there are cores."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Replay on a Ray cluster instead: its address, auto, or local for one on this machine. Needs egoloc[ray]."""
+    resume: bool = False
+    """Go on with a replay that was stopped: finished logs stay, the others run. Logs and settings must be the same."""
+    states_hz: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
+    """States written, 1/s (0: none); default: all. All are scored in any case."""
+    decisions: Literal["all", "rejected", "none"] = "all"
+    """Decisions on measurements written. All are counted in any case."""
     overwrite: bool = False
     """Replace RUN if it is a run folder."""
     json: bool = False
-    """Print metrics.json instead of the table; of several logs, one object with a key each."""
+    """Print metrics.json instead of the table."""
 
-    def run(self, arguments: tuple[str, ...]) -> None:
+    def run(self, arguments: tuple[str, ...]) -> int:
         """Replay every log; arguments: the command line, for the manifest."""
-        from replay.harness import replay_file
-        from replay.store import check_free
+        from replay.batch import Job
+        from replay.sources import parse
 
-        config, folders = self._settings(), self._folders()
-        for folder in folders.values():
-            check_free(folder, overwrite=self.overwrite)
-        metrics = {}
-        for log, folder in folders.items():
-            with stage(f"replaying {log}"):
-                done = replay_file(
-                    log, folder, config, reference_file=self.reference, overwrite=self.overwrite, command=arguments
-                )
-            metrics[log.stem] = done.metrics
-            if not self.json:
-                _show(done.metrics, folder, heading=str(log) if len(folders) > 1 else None)
-        if self.json:
-            print_json(metrics if len(folders) > 1 else next(iter(metrics.values())))
+        sources = [source for text in self.logs for source in parse(text)]
+        self._check(sources)
+        # a run that was resumed is the same run
+        command = tuple(argument for argument in arguments if argument != "--resume")
+        job = Job(self._settings(), self._keep(), self.reference, command)
+        if len(sources) == 1:
+            return self._one(sources[0], job)
+        return self._many(sources, job)
+
+    def _check(self, sources: Sequence["LogSource"]) -> None:
+        """What no single option can tell."""
+        if not sources:
+            raise EgolocError("replay: expected at least one log")
+        if self.workers is not None and self.workers < 1:
+            raise EgolocError(f"--workers: expected 1 or more, got {self.workers}")
+        if self.workers is not None and self.ray is not None:
+            raise EgolocError("--workers and --ray: expected one of them: on a cluster every core is used")
+        if self.resume and self.overwrite:
+            raise EgolocError("--resume and --overwrite: expected one of them")
 
     def _settings(self) -> "RunConfig":
         from replay.config import RunConfig, load_config, named_limits, parse_hide_gnss
@@ -71,91 +88,41 @@ class Replay:
             config = msgspec.structs.replace(config, limits=named_limits(self.limits))
         if self.hide_gnss is not None:
             config = msgspec.structs.replace(config, hide_gnss=parse_hide_gnss(self.hide_gnss))
+        if self.reference is not None and config.hide_gnss is not None:
+            raise EgolocError("--hide-gnss scores against the hidden fixes: leave out --reference")
         return config
 
-    def _folders(self) -> dict[Path, Path]:
-        """Log -> run folder."""
-        if not self.logs:
-            raise EgolocError("replay: expected at least one log")
-        if len(self.logs) == 1:
-            return {self.logs[0]: self.out}
-        repeated = [stem for stem, n in Counter(log.stem for log in self.logs).items() if n > 1]
-        if repeated:
-            raise EgolocError(f"replay: expected logs of different names, got {repeated[0]!r} twice")
-        if (self.out / "manifest.json").exists():
-            raise EgolocError(f"{self.out}: is a run folder: choose another --out to hold the runs of several logs")
-        return {log: self.out / log.stem for log in self.logs}
+    def _keep(self) -> Any:
+        from replay.store import Keep
 
+        if self.states_hz is not None and not 0 <= self.states_hz < float("inf"):
+            raise EgolocError(f"--states-hz: expected 0 or more, got {self.states_hz:g}")
+        return Keep(self.states_hz, self.decisions)
 
-@dataclass(frozen=True)
-class Score:
-    """Compute the metrics of a run again from its tables, for instance with other limits; nothing is filtered."""
+    def _one(self, source: "LogSource", job: "Job") -> int:
+        """A log becomes the run folder."""
+        from replay.single import resumed, run_single
 
-    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """A run folder; its metrics.json is replaced."""
-    limits: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Limits on the error: paper, highway or local-street (see replay); default: those of the run's config.toml."""
-    json: bool = False
-    """Print metrics.json instead of the table."""
-
-    def run(self, _: tuple[str, ...]) -> None:
-        from replay.config import load_config, named_limits
-        from replay.scoring import score
-        from replay.store import load_run, write_json
-
-        run = load_run(self.folder)
-        limits = (
-            named_limits(self.limits) if self.limits is not None else load_config(self.folder / "config.toml").limits
-        )
-        metrics = score(run, limits)
-        try:
-            write_json(self.folder / "metrics.json", metrics)
-        except OSError as error:
-            raise EgolocError(f"{self.folder / 'metrics.json'}: cannot be written: {error.strerror}") from None
+        metrics = resumed(source, self.out, job) if self.resume else None
+        if metrics is None:
+            with stage(f"replaying {source.where}") as tell:
+                metrics = run_single(source, self.out, job, tell, ray=self.ray, overwrite=self.overwrite)
         if self.json:
             print_json(metrics)
         else:
-            _show(metrics, self.folder)
+            show(metrics, self.out)
+        return 0
 
+    def _many(self, sources: Sequence["LogSource"], job: "Job") -> int:
+        """Each log becomes a run folder within RUN."""
+        from replay.campaign import backend_of, run_campaign
+        from replay.store import StorageError
 
-@dataclass(frozen=True)
-class Demo:
-    """Simulate ten minutes of city, write them as an MCAP log, replay it and print the table. Needs no data."""
-
-    out: Annotated[Path, tyro.conf.arg(metavar="RUN")] = Path("runs/demo")
-    """The run folder; the log goes beside it as RUN.mcap. Both replace those of an earlier demo."""
-    json: bool = False
-    """Print metrics.json instead of the table."""
-
-    def run(self, arguments: tuple[str, ...]) -> None:
-        from replay.config import RunConfig
-        from replay.harness import replay_file
-        from replay.run_files import read_json
-        from replay.store import check_free
-        from sensors.mcap.io import write_log
-        from sensors.simulate.drive import simulate
-        from sensors.simulate.scenarios import load
-
-        again = self.out.is_dir() and "demo" in read_json(self.out / "manifest.json").get("command", ())[1:2]
-        check_free(self.out, overwrite=again)
-        path = self.out.with_name(f"{self.out.name}.mcap")
-        scenario = load("demo")
-        with stage(f"simulating {scenario.duration_s:g} s of driving"):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_log(path, simulate(scenario.duration_s, scenario.seed, scenario))
-        with stage(f"replaying {path}"):
-            done = replay_file(path, self.out, RunConfig(), overwrite=again, command=arguments)
-        if self.json:
-            print_json(done.metrics)
-        else:
-            _show(done.metrics, self.out, heading=f"{scenario.doc}\n")
-
-
-def _show(metrics: Mapping[str, Any], folder: Path, heading: str | None = None) -> None:
-    from replay.table import print_run
-
-    if heading:
-        print(heading)
-    print_run(metrics)
-    print(f"Run: {folder}")
-    sys.stdout.flush()
+        backend, go_on = backend_of(len(sources), self.workers, self.ray), "the same command with --resume goes on"
+        try:
+            done = run_campaign(sources, self.out, job, backend, resume=self.resume, overwrite=self.overwrite)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(go_on) from None
+        except StorageError as error:
+            raise StorageError(f"{error}; with that mended, {go_on}") from None
+        return show_campaign(done, self.out, as_json=self.json)

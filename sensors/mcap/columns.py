@@ -1,4 +1,4 @@
-"""One topic's messages as columns: only the wanted bytes of each are copied, so memory follows the columns.
+"""One topic's messages as columns: only the wanted bytes of each are copied, and rows that are done with are discarded.
 
 Messages that are laid out alike (same size, same string and sequence lengths) go through one compiled loop; at a
 message that is laid out differently the offsets are found anew from its schema.
@@ -21,6 +21,8 @@ Ints = NDArray[np.int64]
 
 BLOCK = 1 << 16
 """Messages indexed at a time, and rows in a block."""
+MAX_TEXT_BYTES = 1024
+"""Of a text no more is kept."""
 _LAYOUTS = 256
 """Layouts that a topic remembers."""
 
@@ -64,7 +66,9 @@ _ANY = _Layout(-1, _NO_CHECKS, _NO_SAMPLE, _NO_COPIES, ())
 class Topic:
     """One topic's messages: columns where its schema is wanted, else only log times.
 
-    count: messages seen; unreadable: reason -> messages that were skipped; texts: (row, texts) from that row on.
+    count: messages seen; unreadable: reason -> messages that were skipped; seen: rows so far; rows: those not discarded
+    yet; texts: (row, texts) from that row on; first: the texts of the first row of all, None before; moved: a speed
+    other than zero was decoded.
     """
 
     name: str
@@ -75,25 +79,29 @@ class Topic:
     count: int = 0
     unreadable: Counter[str] = field(default_factory=Counter)
     texts: list[tuple[int, tuple[str, ...]]] = field(default_factory=list)
+    first: tuple[str, ...] | None = None
+    seen: int = 0
     rows: int = 0
+    wanted: Wanted | None = None
+    moved: bool = False
     _definition: cdr.Schema | None = None
-    _wanted: Wanted = field(default_factory=lambda: Wanted({}))
     _blocks: list[tuple[Bytes, Ints]] = field(default_factory=list)
     _filled: int = 0
+    _newest: int | None = None
     _layout: _Layout = _ANY
     _known: dict[int, list[_Layout]] = field(default_factory=dict)
 
     @property
     def frame(self) -> str:
         """The first row's header.frame_id, without a leading slash ("" where it is not kept)."""
-        return self.texts[0][1][0].lstrip("/") if self.texts and self.texts[0][1] else ""
+        return self.first[0].lstrip("/") if self.first else ""
 
     def has_column(self, name: str) -> bool:
         """Whether a column was gathered."""
         return name in (self.dtype.names or ())
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """(N,) or (N, k) float64 column of all rows, in file order."""
+        """(N,) or (N, k) float64 column of all rows, in the order in which they were read."""
         parts = [block[:n].view(self.dtype)[name][:, 0] for block, _, n in self._filled_blocks()]
         shape = self.dtype[name].shape
         out = np.empty((self.rows, *shape))
@@ -109,13 +117,68 @@ class Topic:
         """(N,) int64 log times, ns."""
         return np.concatenate([np.zeros(0, np.int64), *(times[:n] for _, times, n in self._filled_blocks())])
 
+    def newest(self) -> int | None:
+        """The latest log time, or rather the median of the last few, for one alone may be damaged; None before."""
+        if self._filled:
+            last = sorted(self._blocks[-1][1][max(self._filled - 9, 0) : self._filled].tolist())
+            self._newest = last[len(last) // 2]
+        return self._newest
+
+    def row_texts(self) -> list[tuple[str, ...]]:
+        """The texts of every row."""
+        stops = [row for row, _ in self.texts[1:]] + [self.rows]
+        return [texts for (row, texts), stop in zip(self.texts, stops, strict=False) for _ in range(row, stop)]
+
     def in_first_frame(self) -> NDArray[np.bool_]:
-        """(N,) rows whose texts are those of the first row."""
+        """(N,) rows whose texts are those of the first row of all."""
         mask = np.ones(self.rows, bool)
         stops = [row for row, _ in self.texts[1:]] + [self.rows]
         for (row, texts), stop in zip(self.texts, stops, strict=False):
-            mask[row:stop] = texts == self.texts[0][1]
+            mask[row:stop] = texts == self.first
         return mask
+
+    def discard(self, done: NDArray[np.bool_]) -> None:
+        """Forget rows (N,) and free what they took."""
+        blocks, rest = self._filled_blocks(), ~done
+        ends = np.cumsum([0, *(n for _, _, n in blocks)])
+        kept = [(b[:n][rest[i:j]], t[:n][rest[i:j]]) for (b, t, n), i, j in zip(blocks, ends, ends[1:], strict=False)]
+        self.texts = self._texts_of(np.flatnonzero(rest))
+        self._blocks, self._filled, self.rows = self._blocks[:1], 0, 0
+        for rows, times in kept:
+            self._append(rows, times)
+
+    def _texts_of(self, rest: NDArray[np.intp]) -> list[tuple[int, tuple[str, ...]]]:
+        """Texts by the new numbers of the rows that stay; the last ones hold for the rows to come."""
+        starts = [row for row, _ in self.texts]
+        number = np.searchsorted(starts, rest, side="right") - 1
+        changes = np.flatnonzero(np.diff(number, prepend=-1))
+        kept = [(int(row), self.texts[number[row]][1]) for row in changes]
+        if self.texts and (not kept or kept[-1][1] != self.texts[-1][1]):
+            kept.append((len(rest), self.texts[-1][1]))
+        return kept
+
+    def _append(self, rows: Bytes, times: Ints) -> None:
+        """Copy rows behind the last one."""
+        first = 0
+        while first < len(rows):
+            block, block_times = self._room()
+            stop = min(first + len(block) - self._filled, len(rows))
+            place = slice(self._filled, self._filled + stop - first)
+            block[place], block_times[place] = rows[first:stop], times[first:stop]
+            self._filled, self.rows, first = place.stop, self.rows + stop - first, stop
+
+    def _room(self) -> tuple[Bytes, Ints]:
+        """The last block, a new one where it is full."""
+        if not self._blocks or self._filled == len(self._blocks[-1][0]):
+            self._blocks.append((np.empty((BLOCK, self.dtype.itemsize), np.uint8), np.empty(BLOCK, np.int64)))
+            self._filled = 0
+        return self._blocks[-1]
+
+    def add_times(self, log_time: Ints) -> None:
+        """Take in messages of which only the log times (N,) are known."""
+        self._append(np.empty((len(log_time), self.dtype.itemsize), np.uint8), log_time)
+        self.count += len(log_time)
+        self.seen += len(log_time)
 
     def _filled_blocks(self) -> list[tuple[Bytes, Ints, int]]:
         last = len(self._blocks) - 1
@@ -125,16 +188,14 @@ class Topic:
         """Take this topic's messages out of the indexed ones."""
         first = 0
         while first < index.count:
-            if not self._blocks or self._filled == len(self._blocks[-1][0]):
-                self._blocks.append((np.empty((BLOCK, self.dtype.itemsize), np.uint8), np.empty(BLOCK, np.int64)))
-                self._filled = 0
-            rows, times = self._blocks[-1]
+            rows, times = self._room()
             layout, before = self._layout, self._filled
             first, self._filled = _kernels.gather(
                 records, index.at, index.size, index.slot, index.log_time, first, index.count, slot,
                 layout.size, layout.checks, layout.sample, layout.copies, rows, times, before,
             )  # fmt: skip
             self.rows += self._filled - before
+            self.seen += self._filled - before
             self.count += self._filled - before
             if first < index.count and self._filled < len(rows):
                 first += self._change_layout(records, int(index.at[first]), int(index.size[first]))
@@ -146,7 +207,8 @@ class Topic:
         if layout is None:
             try:
                 assert self._definition is not None
-                layout = _layout(self._definition, self._wanted, self.dtype, message.tobytes())
+                assert self.wanted is not None
+                layout = _layout(self._definition, self.wanted, self.dtype, message.tobytes())
             except cdr.MalformedMessageError as error:
                 self.unreadable[str(error)] += 1
                 self.count += 1
@@ -155,6 +217,8 @@ class Topic:
                 self._known.clear()
             self._known.setdefault(size, []).append(layout)
         self._layout = layout
+        if self.first is None:
+            self.first = layout.texts
         if not self.texts or self.texts[-1][1] != layout.texts:
             self.texts.append((self.rows, layout.texts))
         return 0
@@ -189,7 +253,7 @@ def _layout(schema: cdr.Schema, wanted: Wanted, dtype: np.dtype[np.void], data: 
 
 
 def _text(data: bytes, offset: int, size: int) -> str:
-    return data[offset : offset + size].rstrip(b"\0").decode("utf-8", "replace")
+    return data[offset : offset + min(size, MAX_TEXT_BYTES)].rstrip(b"\0").decode("utf-8", "replace")
 
 
 def row_dtype(schema: cdr.Schema, wanted: Wanted) -> np.dtype[np.void]:
@@ -205,7 +269,7 @@ def row_dtype(schema: cdr.Schema, wanted: Wanted) -> np.dtype[np.void]:
 
 def open_topic(channel: ChannelRecord, schema: SchemaRecord, wanted: Wanted | None) -> Topic:
     """An empty topic, with the reason why its messages cannot be read where there is one."""
-    topic = Topic(channel.topic, schema, channel.encoding)
+    topic = Topic(channel.topic, schema, channel.encoding, wanted=wanted)
     if wanted is None:
         topic.unsupported = f"schema {schema.name or '(none)'} feeds no sensor"
     elif channel.encoding != "cdr" or schema.encoding != "ros2msg":
@@ -216,7 +280,6 @@ def open_topic(channel: ChannelRecord, schema: SchemaRecord, wanted: Wanted | No
         try:
             topic._definition = cdr.parse_schema(schema.name, schema.text)
             topic.dtype = row_dtype(topic._definition, wanted)
-            topic._wanted = wanted
             topic._layout = _ANY._replace(size=-2)
         except EgolocError as error:
             topic.unsupported = str(error)

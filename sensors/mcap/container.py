@@ -8,6 +8,7 @@ import struct
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import lz4.frame
@@ -20,7 +21,7 @@ Bytes = NDArray[np.uint8]
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEADER = 9
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
-CHUNK_INDEX, METADATA, DATA_END = 8, 12, 15
+MESSAGE_INDEX, CHUNK_INDEX, METADATA, METADATA_INDEX, DATA_END = 7, 8, 12, 13, 15
 FIRST_PRIVATE = 0x80
 """Opcodes from here on are extensions that a reader skips; others beyond DATA_END are damage."""
 _FOOTER_SIZE = RECORD_HEADER + 20 + len(MAGIC)
@@ -28,6 +29,7 @@ MAX_CHUNK = 1 << 30
 """The largest uncompressed chunk, bytes."""
 _MAX_RATIO = {"zstd": 40_000, "lz4": 260, "": 1}
 """No compressor shrinks further than this (zstd: 128 KiB in a 4-byte block), so a larger claim is damage."""
+_INDEX_PAIR = np.dtype([("channel", "<u2"), ("place", "<u8")])
 
 
 class DamagedError(ValueError):
@@ -99,23 +101,47 @@ class Definitions:
         return identifier
 
 
+class ChunkEntry(NamedTuple):
+    """What the summary says of a chunk: its record starts at start, next is where its message indexes end.
+
+    first_ns: the earliest log time in it; indexes: channel id -> where the message index of its messages lies (empty
+    where there are none).
+    """
+
+    start: int
+    next: int
+    first_ns: int
+    compression: str
+    indexes: Mapping[int, int]
+
+
 @dataclass(frozen=True)
 class Summary:
-    """What the end of a file says: its definitions, where its chunks start, whether it is there at all."""
+    """What the end of a file says: its definitions, its chunks by place, its metadata records, whether it is there."""
 
-    definitions: Definitions
-    chunk_starts: tuple[int, ...]
-    present: bool
+    definitions: Definitions = field(default_factory=Definitions)
+    chunks: tuple[ChunkEntry, ...] = ()
+    metadata: tuple[int, ...] = ()
+    present: bool = False
+
+    @cached_property
+    def chunk_starts(self) -> tuple[int, ...]:
+        """Where the chunks start, in order."""
+        return tuple(entry.start for entry in self.chunks)
 
 
 class ChunkHeader(NamedTuple):
-    """A chunk's own fields; data lies at [start, stop) of the file, cut short where stop passes the file's end."""
+    """A chunk's own fields; data lies at [start, stop) of the file, cut short where stop passes the file's end.
+
+    first_ns: the earliest log time in it, which no checksum covers.
+    """
 
     compression: str
     size: int
     crc: int
     start: int
     stop: int
+    first_ns: int = 0
 
 
 def record_at(data: memoryview, at: int) -> tuple[int, int, int]:
@@ -128,7 +154,7 @@ def record_at(data: memoryview, at: int) -> tuple[int, int, int]:
 
 def read_summary(data: memoryview) -> Summary:
     """The summary section, empty unless footer, magic and checksum are in order."""
-    nothing = Summary(Definitions(), (), present=False)
+    nothing = Summary()
     if len(data) < len(MAGIC) + _FOOTER_SIZE or data[-len(MAGIC) :] != MAGIC:
         return nothing
     at = len(data) - _FOOTER_SIZE
@@ -144,7 +170,7 @@ def read_summary(data: memoryview) -> Summary:
 
 
 def _summary(data: memoryview, at: int) -> Summary:
-    definitions, starts = Definitions(), []
+    definitions, chunks, metadata = Definitions(), [], []
     while at < len(data):
         opcode, content, stop = record_at(data, at)
         record = Parser(data, content, min(stop, len(data)))
@@ -153,20 +179,43 @@ def _summary(data: memoryview, at: int) -> Summary:
         elif opcode == CHANNEL:
             definitions.add_channel(record)
         elif opcode == CHUNK_INDEX:
-            record.raw(16)
-            starts.append(record.integer(8))
+            chunks.append(_chunk_entry(record))
+        elif opcode == METADATA_INDEX:
+            metadata.append(record.integer(8))
         at = stop
-    return Summary(definitions, tuple(sorted(starts)), present=True)
+    return Summary(definitions, tuple(sorted(chunks, key=lambda entry: entry.start)), tuple(metadata), present=True)
+
+
+def _chunk_entry(record: Parser) -> ChunkEntry:
+    first_ns, _, start, length = (record.integer(8) for _ in range(4))
+    pairs = np.frombuffer(record.raw(record.integer(4)), np.uint8)
+    if len(pairs) % _INDEX_PAIR.itemsize:
+        raise DamagedError("a field passes the end of its record")
+    indexes = {int(channel): int(place) for channel, place in pairs.view(_INDEX_PAIR).tolist()}
+    index_length, compression = record.integer(8), record.text()
+    return ChunkEntry(start, start + length + index_length, first_ns, compression, indexes)
+
+
+def indexed_times(data: memoryview, at: int, channel: int) -> NDArray[np.int64]:
+    """(N,) log times in the message index of a channel at an offset; DamagedError where there is none."""
+    opcode, content, stop = record_at(data, at)
+    record = Parser(data, content, min(stop, len(data)))
+    if opcode != MESSAGE_INDEX or record.integer(2) != channel:
+        raise DamagedError("the message index of a chunk is damaged")
+    pairs = np.frombuffer(record.raw(record.integer(4)), np.uint8)
+    if len(pairs) % 16:
+        raise DamagedError("the message index of a chunk is damaged")
+    return pairs.view("<i8")[::2].astype(np.int64)
 
 
 def chunk_header(data: memoryview, content: int, stop: int) -> ChunkHeader:
     """A chunk's header; its data may be cut short by the end of the file, and by nothing else."""
     record = Parser(data, content, min(stop, len(data)))
-    record.raw(16)
-    size, crc, compression, length = record.integer(8), record.integer(4), record.text(), record.integer(8)
+    first_ns, _, size, crc = record.integer(8), record.integer(8), record.integer(8), record.integer(4)
+    compression, length = record.text(), record.integer(8)
     if length > stop - record.at:
         raise DamagedError("chunk is longer than its record")
-    return ChunkHeader(compression, size, crc, record.at, record.at + length)
+    return ChunkHeader(compression, size, crc, record.at, record.at + length, first_ns)
 
 
 def decompress(data: memoryview, chunk: ChunkHeader) -> Bytes:

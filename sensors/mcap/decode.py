@@ -1,4 +1,4 @@
-"""Gathered columns -> records. Rows that a record cannot hold are left out and counted, with the reason.
+"""Gathered columns -> columns of records, and which rows a record cannot hold, with the reason.
 
 GNSS status: NavSatStatus -1 none, 0 single, 1 (SBAS) DGNSS, 2 (GBAS) float, or fixed where its known covariance claims
 5 cm or better (the message does not tell them apart); GPSStatus also 18, 33 DGNSS, 19 fixed, 20 float.
@@ -8,33 +8,29 @@ Altitude is taken as height above the ellipsoid.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sensors.clock import NS_PER_S
 from sensors.mcap.columns import Topic
+from sensors.mcap.decoded import Decoded, build
+from sensors.mcap.tags import decode_tags
 from sensors.records import (
     GnssFix,
     GnssStatus,
     GnssVelocity,
     Imu,
-    LeftOut,
     PoseFix,
     Trajectory,
     WheelSpeed,
     positive_definite,
 )
 from sensors.rotation import wrap, yaw_from_q
-from sensors.screening import screen
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Decoded = tuple[Any, tuple[LeftOut, ...]]
 
-LATE_NS = NS_PER_S
-"""A message this much behind the newest stamp came late and is put in order; further back its stamp is wrong."""
+
 SIGMA_95 = 1.959963984540054
 """95 % of a normal variable lies within this many sigmas."""
 RADIUS_95 = 2.447746830680816
@@ -69,7 +65,7 @@ def decode_imu(topic: Topic) -> Decoded:
         "angular_velocity is marked as not measured (covariance -1)": topic.column("gyro_known") != -1,
         "linear_acceleration is marked as not measured (covariance -1)": topic.column("accel_known") != -1,
     }
-    return _build(Imu, topic, {"gyro": gyro, "accel": accel}, valid, late=False)
+    return build(Imu, topic, {"gyro": gyro, "accel": accel}, valid, late=False)
 
 
 def decode_gnss(topic: Topic) -> Decoded:
@@ -94,7 +90,7 @@ def decode_gnss(topic: Topic) -> Decoded:
     columns = {"llh": llh, "cov_enu": cov, "status": status}
     if topic.has_column("heading"):
         columns["yaw"], columns["yaw_sigma"] = _yaw(topic.column("heading"))
-    return _build(GnssFix, topic, columns, valid)
+    return build(GnssFix, topic, columns, valid)
 
 
 def _default_covariance(topic: Topic, status: NDArray[np.int8]) -> Floats:
@@ -116,22 +112,23 @@ def _yaw(heading: Floats) -> tuple[Floats, Floats]:
     return yaw, np.where(given, np.radians(np.where(given, heading[:, 1], 0.0)) / SIGMA_95, np.nan)
 
 
-def decode_gnss_velocity(topic: Topic) -> Decoded:
+def decode_gnss_velocity(topic: Topic) -> Decoded | None:
     """TwistWithCovarianceStamped in ENU axes, or the speed, track and climb of a GPSFix."""
     if topic.has_column("motion"):
         return _decode_motion(topic)
     vel, cov = topic.column("vel"), topic.column("cov").reshape(-1, 3, 3)
     valid = _sane("twist.linear", vel, MAX_SPEED, "m/s") | _covariance_valid("twist.covariance", cov)
-    return _build(GnssVelocity, topic, {"vel_enu": vel, "cov_enu": cov}, valid)
+    return build(GnssVelocity, topic, {"vel_enu": vel, "cov_enu": cov}, valid)
 
 
-def _decode_motion(topic: Topic) -> Decoded:
-    """Velocities of a GPSFix; none at all where it is not filled in. A speed of zero needs no track."""
+def _decode_motion(topic: Topic) -> Decoded | None:
+    """Velocities of a GPSFix; none at all as long as none was filled in. A speed of zero needs no track."""
     speed, track, climb = topic.column("motion").T
     track = np.where(speed == 0.0, 0.0, track)
     finite = np.isfinite(speed) & np.isfinite(track) & np.isfinite(climb)
-    if not finite.any() or not (speed[finite].any() or climb[finite].any()):
-        return None, ()
+    topic.moved |= bool(speed[finite].any() or climb[finite].any())
+    if not topic.moved:
+        return None
     speed, climb, angle = (np.where(finite, x, 0.0) for x in (speed, climb, np.radians(track)))
     err = topic.column("motion_err") / SIGMA_95
     given = np.isfinite(err) & (err > 0)
@@ -150,7 +147,7 @@ def _decode_motion(topic: Topic) -> Decoded:
         f"speed or climb is beyond {MAX_SPEED:g} m/s": _inside(vel, (MAX_SPEED,) * 3),
         **_covariance_valid("err_speed or err_climb", cov),
     }
-    return _build(GnssVelocity, topic, {"vel_enu": vel, "cov_enu": cov}, valid)
+    return build(GnssVelocity, topic, {"vel_enu": vel, "cov_enu": cov}, valid)
 
 
 def decode_pose_fixes(topic: Topic) -> Decoded:
@@ -163,7 +160,7 @@ def decode_pose_fixes(topic: Topic) -> Decoded:
         **_covariance_valid("pose.covariance of x, y, yaw", cov),
     }
     pose = np.column_stack((p[:, :2], yaw_from_q(q)))
-    return _build(PoseFix, topic, {"pose": pose, "cov": cov}, valid)
+    return build(PoseFix, topic, {"pose": pose, "cov": cov}, valid)
 
 
 def decode_wheel(topic: Topic) -> Decoded:
@@ -173,7 +170,7 @@ def decode_wheel(topic: Topic) -> Decoded:
     valid = _sane("twist.linear.x", speed[:, None], MAX_SPEED, "m/s")
     valid["twist.covariance[0] is not positive"] = measured
     sigma = np.sqrt(np.where(measured, variance, 1.0))
-    return _build(WheelSpeed, topic, {"speed": speed, "sigma": sigma}, valid)
+    return build(WheelSpeed, topic, {"speed": speed, "sigma": sigma}, valid)
 
 
 def decode_reference(topic: Topic) -> Decoded:
@@ -192,51 +189,19 @@ def decode_reference(topic: Topic) -> Decoded:
         known = filled_in & np.isfinite(chosen) & (chosen >= 0)
         sigma[:, k] = np.sqrt(np.where(known, chosen, np.nan))
     valid = _sane("pose.position", p, MAX_COORDINATE, "m")
-    return _build(Trajectory, topic, {"p_map": p, "q_map_body": q, "sigma": sigma}, valid, late=False)
+    return build(Trajectory, topic, {"p_map": p, "q_map_body": q, "sigma": sigma}, valid, late=False)
 
 
-DECODERS: Mapping[str, Callable[[Topic], Decoded]] = {
+DECODERS: Mapping[str, Callable[[Topic], Decoded | None]] = {
     "imu": decode_imu,
     "gnss": decode_gnss,
     "gnss_velocity": decode_gnss_velocity,
     "pose_fixes": decode_pose_fixes,
     "wheel": decode_wheel,
     "reference": decode_reference,
+    "scene": decode_tags,
+    "mode": decode_tags,
 }
-
-
-def stamps(topic: Topic) -> tuple[NDArray[np.int64], Mask]:
-    """(N,) header stamps, ns, and which of them have whole nanoseconds below a second."""
-    nanosec = topic.integers("nanosec")
-    return topic.integers("sec") * NS_PER_S + nanosec, (nanosec >= 0) & (nanosec < NS_PER_S)
-
-
-def _build(
-    record: Callable[..., Any], topic: Topic, columns: dict[str, Any], valid: dict[str, Mask], *, late: bool = True
-) -> Decoded:
-    """The record of the rows that pass, in stamp order (late: messages that came a little late are put in order)."""
-    t_ns, whole = stamps(topic)
-    arrival = topic.log_time()
-    valid |= {"header.stamp.nanosec is not below 1e9": whole, "log time is beyond int64": arrival >= 0}
-    if len(topic.texts) > 1:
-        valid["header.frame_id is not that of the first message"] = topic.in_first_frame()
-    columns = {"t_ns": t_ns, "arrival_ns": arrival, **columns}
-    if late and (t_ns[1:] < t_ns[:-1]).any():
-        order = _stamp_order(t_ns)
-        columns = {name: column[order] for name, column in columns.items()}
-        valid = {reason: mask[order] for reason, mask in valid.items()}
-    keep, left_out = screen(topic.name, columns["t_ns"], columns["arrival_ns"], valid)
-    if not keep.any():
-        return None, left_out
-    if not keep.all():
-        columns = {name: column[keep] for name, column in columns.items()}
-    return record(**columns), left_out
-
-
-def _stamp_order(t_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Rows by stamp, where a stamp too far behind keeps its place (and is left out as going back)."""
-    newest = np.maximum.accumulate(t_ns)
-    return np.argsort(np.where(newest - t_ns > LATE_NS, newest, t_ns), kind="stable")
 
 
 def _finite(values: Floats) -> Mask:

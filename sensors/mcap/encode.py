@@ -4,7 +4,7 @@ GNSS (GPSFix): ENU covariance in position_covariance (type KNOWN); status by _GP
 deg clockwise from north, and its 95 % error as ``err_dip``, NaN where there is none; speed, track and climb are NaN,
 for velocities have their own topic. Reference (Odometry): an unknown attitude is the quaternion (0, 0, 0, 0), an
 unknown sigma the variance -1, as are the twist and whatever else the record does not hold. Pose fix and velocities:
-axes that the record does not hold have variance UNMEASURED.
+axes that the record does not hold have variance UNMEASURED. Tags (String) have no header: their stamp is the log time.
 """
 
 from collections.abc import Mapping
@@ -18,8 +18,9 @@ from sensors.errors import EgolocError
 from sensors.mcap import cdr
 from sensors.mcap.decode import SIGMA_95
 from sensors.mcap.schemas import schema_text
-from sensors.mcap.topics import GPS_FIX, IMU, ODOMETRY, POSE, TWIST
-from sensors.records import GnssFix, GnssStatus, GnssVelocity, Imu, Log, PoseFix, Trajectory, WheelSpeed
+from sensors.mcap.tags import problem
+from sensors.mcap.topics import GPS_FIX, IMU, ODOMETRY, POSE, STRING, TWIST
+from sensors.records import GnssFix, GnssStatus, GnssVelocity, Imu, Log, PoseFix, Tags, Trajectory, WheelSpeed
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,9 +40,16 @@ _SOURCE_GPS = 1
 _SOURCE_POINTS = 2
 
 
+TOPICS = ("/imu", "/gnss/fix", "/gnss/velocity", "/egovm/pose", "/wheel/speed", "/reference", "/scene", "/drive_mode")
+"""What we write, in the order of the channels."""
+
+
 @dataclass(frozen=True, eq=False)
 class Messages:
-    """A topic's messages: fields by path (``name[k]`` an array's element), each (N,) or one number for all."""
+    """Messages of a topic with the same texts.
+
+    fields: by path (``name[k]`` an array's element), each (N,) or one number for all.
+    """
 
     topic: str
     schema: str
@@ -77,7 +85,7 @@ class Rows:
 
 
 def messages_of(log: Log) -> list[Messages]:
-    """Every record of a log as messages of its topic; records without rows are left out."""
+    """Every record of a log as messages of its topic (tags: for each text); records without rows are left out."""
     made = []
     if log.imu:
         made.append(_imu(log.imu))
@@ -91,6 +99,10 @@ def messages_of(log: Log) -> list[Messages]:
         made.append(_wheel(log.wheel))
     if log.reference:
         made.append(_reference(log.reference))
+    if log.scene:
+        made += _tags("/scene", log.scene)
+    if log.mode:
+        made += _tags("/drive_mode", log.mode)
     return made
 
 
@@ -192,3 +204,15 @@ def _reference(reference: Trajectory) -> Messages:
         "twist.covariance[0]": -1.0,
     }
     return _messages("/reference", ODOMETRY, "map", reference.t_ns, reference.arrival_ns, fields, child_frame_id="body")
+
+
+def _tags(topic: str, tags: Tags) -> list[Messages]:
+    made = []
+    for text in np.unique(tags.text).tolist():
+        if why := problem(text):
+            raise EgolocError(f"{topic}: {why}, got {text[:40]!r}")
+        t_ns = tags.t_ns[tags.text == text]
+        if t_ns[0] < 0:
+            raise EgolocError(f"{topic}: t_ns: expected times since 1970, got {t_ns[0]}")
+        made.append(Messages(topic, STRING, {"data": text}, {}, t_ns, t_ns))
+    return made

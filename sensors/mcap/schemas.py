@@ -5,6 +5,7 @@ Sources: common_interfaces (Humble) and gps_msgs (swri-robotics/gps_umd), withou
 
 _DEFINITIONS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "std_msgs/String": "string data",
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
     "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",

@@ -1,16 +1,20 @@
 """Walks an MCAP file from front to back and yields its stretches of schemas, channels and messages, decompressed.
 
-The file is mapped, and pages behind the walk are given back, so memory does not follow the file's size.
+Where the summary tells, chunks are read in order of their log times and those that nobody wants are passed over. The
+file is mapped, and pages that were read are given back, so memory does not follow the file's size.
 """
 
+import heapq
 import mmap
 import os
 import stat
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,13 +23,15 @@ from numpy.typing import NDArray
 
 from sensors.errors import EgolocError
 from sensors.mcap import _kernels, container
-from sensors.mcap.container import ChunkHeader, DamagedError, Parser, Summary
+from sensors.mcap.container import ChunkEntry, ChunkHeader, DamagedError, Parser, Summary
 
 Bytes = NDArray[np.uint8]
 _RUN = 4 << 20
 """Unchunked records are handed on in stretches of about this many bytes."""
 _KEEP = 32 << 20
-"""Mapped bytes behind the walk that are given back at once."""
+"""Bytes that are read before the mapped pages are given back."""
+LAST = 1 << 64
+"""Beyond every log time."""
 
 
 class Section(NamedTuple):
@@ -37,9 +43,37 @@ class Section(NamedTuple):
     in_chunk: bool
 
 
+class _Ahead:
+    """The order in which the summary's chunks are to be read: by turn, which is a log time (place -> turn).
+
+    It is the start of a chunk, but not before the turns of those in front of it that hold the same channels, so that
+    the messages of a topic keep their order. A chunk whose channels are not told may hold all of them.
+    """
+
+    def __init__(self, chunks: Sequence[ChunkEntry]) -> None:
+        self.turn: dict[int, int] = {}
+        channels = {channel for entry in chunks for channel in entry.indexes} | {-1}
+        latest = dict.fromkeys(channels, 0)
+        for entry in chunks:
+            mine = entry.indexes or channels
+            turn = max(entry.first_ns, *(latest[channel] for channel in mine))
+            latest |= dict.fromkeys(mine, turn)
+            self.turn[entry.start] = turn
+        self._places = [entry.start for entry in chunks]
+        self._earliest = [LAST, *accumulate(reversed(self.turn.values()), min)][::-1]
+
+    def earliest(self, at: int) -> int:
+        """The earliest turn of a chunk behind an offset."""
+        return self._earliest[bisect_right(self._places, at)]
+
+
 @dataclass
 class Container:
-    """An open MCAP file and what a walk over it found: metadata, damage (reason -> count), bytes lost."""
+    """An open MCAP file and what a walk over it found: metadata, damage (reason -> count), bytes lost.
+
+    read_up_to: every message of an earlier log time was in the sections so far; without a summary a guess, the latest
+    start of a chunk.
+    """
 
     path: Path
     data: memoryview
@@ -52,35 +86,76 @@ class Container:
     unchunked: bool = False
     bytes_lost: int = 0
     complete: bool = False
+    read_up_to: int = 0
+    _pages: int = 0
 
     @property
     def truncated(self) -> bool:
         """Whether the file ends before its end marker."""
         return not self.complete
 
-    def sections(self) -> Iterator[Section]:
-        """Every stretch in file order; a damaged chunk is counted and passed over."""
-        for part in self._parts():
+    def sections(
+        self, unwanted: Callable[[ChunkEntry], bool], pass_over: Callable[[ChunkEntry], None]
+    ) -> Iterator[Section]:
+        """Every stretch, chunks in order of log time as far as the summary tells; a damaged one is counted.
+
+        unwanted: whether a chunk of the summary is not to be read; pass_over: called for such a one in its place.
+        """
+        passed = {entry.start: entry for entry in self.summary.chunks if unwanted(entry)}
+        ahead = _Ahead([entry for entry in self.summary.chunks if entry.start not in passed])
+        waiting: list[tuple[int, int, ChunkHeader]] = []
+        for at, part in self._parts(passed, pass_over):
             if isinstance(part, Section):
                 yield part
                 continue
-            try:
-                records = container.decompress(self.data, part)
-            except DamagedError as error:
-                self.damage[str(error)] += 1
-                continue
-            yield Section(records, 0, len(records), in_chunk=True)
+            heapq.heappush(waiting, (ahead.turn.get(at, part.first_ns), at, part))
+            earliest = ahead.earliest(at)
+            while waiting and waiting[0][0] <= earliest:
+                yield from self._next(waiting, earliest)
+        while waiting:
+            yield from self._next(waiting, LAST)
 
-    def _parts(self) -> Iterator[Section | ChunkHeader]:
-        """Sections that lie open in the file and chunks still to read; metadata, damage and the end are noted here."""
-        at, given_back, size = len(container.MAGIC), 0, len(self.data)
+    def _next(self, waiting: list[tuple[int, int, ChunkHeader]], earliest: int) -> Iterator[Section]:
+        """The chunk whose turn it is; earliest: the turn of those still to come."""
+        turn, _, chunk = heapq.heappop(waiting)
+        bound = min(earliest, waiting[0][0]) if waiting else earliest
+        self.read_up_to = max(self.read_up_to, turn if bound == LAST else bound)
+        yield from self._decompressed(chunk)
+
+    def _decompressed(self, chunk: ChunkHeader) -> Iterator[Section]:
+        try:
+            records = container.decompress(self.data, chunk)
+        except DamagedError as error:
+            self.damage[str(error)] += 1
+            return
+        yield Section(records, 0, len(records), in_chunk=True)
+        self._give_back(chunk.stop - chunk.start)
+
+    def _parts(
+        self, passed: Mapping[int, ChunkEntry], pass_over: Callable[[ChunkEntry], None]
+    ) -> Iterator[tuple[int, Section | ChunkHeader]]:
+        """Sections that lie open in the file and chunks still to read, each with its place.
+
+        Metadata, damage and the end are noted here. passed: chunks to pass over, by place.
+        """
+        at, size = len(container.MAGIC), len(self.data)
         while at < size:
             limit = self._next_chunk(at)
+            entry = passed.get(at)
+            if entry is not None and at < entry.next <= limit:
+                self.chunks += 1
+                self.compressions.add(entry.compression or "none")
+                try:
+                    pass_over(entry)
+                except DamagedError as error:
+                    self.damage[str(error)] += 1
+                at = entry.next
+                continue
             try:
                 opcode, content, stop = self._record(at, limit)
             except DamagedError:
                 if limit == size:
-                    yield from self._last(at)
+                    yield from ((at, section) for section in self._last(at))
                     return
                 self.damage["damaged stretch between chunks"] += 1
                 self.bytes_lost += limit - at
@@ -91,12 +166,11 @@ class Container:
                 return
             if opcode in {container.SCHEMA, container.CHANNEL, container.MESSAGE}:
                 stop = self._run(at, min(limit, at + _RUN), stop)
-                yield Section(self.file, at, stop, in_chunk=False)
+                yield at, Section(self.file, at, stop, in_chunk=False)
+                self._give_back(stop - at)
             else:
-                yield from self._other(opcode, content, stop)
+                yield from ((at, chunk) for chunk in self._other(opcode, content, stop))
             at = stop
-            if at - given_back > _KEEP:
-                given_back = self._give_back(given_back, at)
 
     def _next_chunk(self, at: int) -> int:
         """Where the next chunk after an offset starts by the summary, else the end of the file."""
@@ -132,11 +206,30 @@ class Container:
                 self.compressions.add(chunk.compression or "none")
                 yield chunk
             elif opcode == container.METADATA:
-                record = Parser(self.data, content, stop)
-                name = record.text()
-                self.metadata[name] = record.mapping()
+                self._take_metadata(content, stop)
         except DamagedError as error:
             self.damage[str(error)] += 1
+
+    def _take_metadata(self, content: int, stop: int) -> None:
+        record = Parser(self.data, content, stop)
+        name = record.text()
+        self.metadata[name] = record.mapping()
+
+    def read_metadata(self) -> None:
+        """Take in the metadata records that the summary names, wherever they lie."""
+        for at in self.summary.metadata:
+            with suppress(DamagedError):  # the walk counts what is damaged
+                opcode, content, stop = self._record(at, len(self.data))
+                if opcode == container.METADATA:
+                    self._take_metadata(content, stop)
+
+    def chunk_at(self, entry: ChunkEntry) -> Section:
+        """One chunk of the summary, out of turn; DamagedError where it cannot be read."""
+        opcode, content, stop = self._record(entry.start, len(self.data))
+        if opcode != container.CHUNK:
+            raise DamagedError("no chunk where the summary says")
+        records = container.decompress(self.data, container.chunk_header(self.data, content, stop))
+        return Section(records, 0, len(records), in_chunk=True)
 
     def _last(self, at: int) -> Iterator[Section]:
         """The record that the end cuts short: an uncompressed chunk without checksum gives its whole messages."""
@@ -157,15 +250,23 @@ class Container:
         """The end of the data section: the file is complete where its last bytes are the magic."""
         self.complete = self.data[-len(container.MAGIC) :] == container.MAGIC
         crc = int.from_bytes(self.data[content : content + 4], "little") if stop - content >= 4 else 0
-        if self.data[at] == container.DATA_END and self.unchunked and crc and zlib.crc32(self.data[:at]) != crc:
+        if self.data[at] == container.DATA_END and self.unchunked and crc and self._checksum(at) != crc:
             self.damage["the data section fails its checksum, its messages are used unchecked"] += 1
 
-    def _give_back(self, start: int, stop: int) -> int:
-        """Unmap the pages in [start, stop) from this process; reading them again is still possible."""
-        stop -= stop % mmap.PAGESIZE
-        if hasattr(mmap, "MADV_DONTNEED"):
-            self.mapped.madvise(mmap.MADV_DONTNEED, start, stop - start)
-        return stop
+    def _checksum(self, stop: int) -> int:
+        crc = 0
+        for at in range(0, stop, _RUN):
+            part = self.data[at : min(at + _RUN, stop)]
+            crc = zlib.crc32(part, crc)
+            self._give_back(len(part))
+        return crc
+
+    def _give_back(self, count: int) -> None:
+        """Count bytes that were read, and now and then unmap all pages from this process; they can be read again."""
+        self._pages += count
+        if self._pages > _KEEP and hasattr(mmap, "MADV_DONTNEED"):
+            self.mapped.madvise(mmap.MADV_DONTNEED)
+            self._pages = 0
 
 
 def open_container(path: str | os.PathLike[str]) -> Container:

@@ -1,7 +1,7 @@
 """What is in a log and what a replay would use of it: describe."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from sensors.clock import NS_PER_S
 from sensors.geodesy import MapFrame
-from sensors.mcap.assembly import METADATA, assemble
+from sensors.mcap.assembly import METADATA, Facts
 from sensors.mcap.columns import Topic
-from sensors.mcap.decode import stamps
-from sensors.mcap.gather import Gatherer
-from sensors.mcap.sections import open_container
-from sensors.mcap.topics import Roles, assign, check_choice, wanted_by
+from sensors.mcap.decoded import stamps
+from sensors.mcap.reader import LogReader
+from sensors.mcap.topics import Roles, conflict
+from sensors.pieces import PIECE_S, summed
 from sensors.records import LeftOut, Log
+from sensors.steps import Steps
 from sensors.vehicle import Vehicle
 
 
@@ -44,7 +45,8 @@ class LogSummary:
     """A log file: its topics in order of appearance, the facts it carries, and the state of the file itself.
 
     rows: sensor -> rows that a replay would use. complete: the file has its end marker; indexed: it has a summary with
-    a checksum that holds; compressions: those of its chunks, empty where it is unchunked.
+    a checksum that holds; compressions: those of its chunks, empty where it is unchunked. conflict: two topics that
+    could feed one sensor, for which read_pieces refuses the log, "" where there are none.
     """
 
     path: str
@@ -60,61 +62,68 @@ class LogSummary:
     chunks: int
     compressions: tuple[str, ...]
     left_out: tuple[LeftOut, ...]
+    conflict: str
 
 
-def describe(path: str | os.PathLike[str], topics: Mapping[str, str] | None = None) -> LogSummary:
-    """Summarize a log; topics as in read_log, but two topics for one sensor are noted, not raised."""
-    chosen = dict(topics or {})
-    check_choice(chosen)
-    source = open_container(path)
-    gatherer = Gatherer(wanted_by(chosen), times=True)
-    gatherer.read(source)
-    roles = assign(gatherer.topics, chosen, gatherer.definitions, source.path)
-    log = assemble(source, gatherer, roles)
+def describe(
+    path: str | os.PathLike[str],
+    topics: Mapping[str, str] | None = None,
+    visit: Callable[[Log], object] | None = None,
+) -> LogSummary:
+    """Summarize a log of any length; topics as in read_pieces, but two topics for one sensor are noted, not raised.
+
+    visit: gets every piece that a replay would get.
+    """
+    steps: dict[Topic, Steps] = {}
+
+    def done(topic: Topic, rows: NDArray[np.bool_]) -> None:
+        times = stamps(topic)[0] if _is_stamped(topic) else topic.log_time()
+        steps.setdefault(topic, Steps()).add(np.sort(times[rows]))
+
+    reader = LogReader(path, topics, PIECE_S, strict=False, times=True, done=done)
+    left_out: list[LeftOut] = []
+    for piece in reader.pieces():
+        left_out += piece.left_out
+        if visit is not None:
+            visit(piece)
+    source, facts = reader.source, reader.facts or Facts()
     return LogSummary(
         path=str(source.path),
         size_bytes=len(source.data),
-        topics=tuple(_topic(topic, roles, log) for topic in gatherer.topics),
-        rows={sensor: len(getattr(log, sensor)) for sensor in roles.sensors if getattr(log, sensor) is not None},
-        vehicle=log.vehicle,
-        map_frame=log.map_frame,
+        topics=tuple(_topic(topic, reader, steps.get(topic, Steps())) for topic in reader.gatherer.topics),
+        rows={sensor: reader.rows[sensor] for sensor in reader.roles.sensors if reader.rows[sensor]},
+        vehicle=facts.vehicle,
+        map_frame=facts.map_frame,
         has_metadata=METADATA in source.metadata,
         complete=source.complete,
         bytes_lost=source.bytes_lost,
         indexed=source.summary.present,
         chunks=source.chunks,
         compressions=tuple(sorted(source.compressions)),
-        left_out=tuple(log.left_out),
+        left_out=summed(left_out),
+        conflict=conflict(reader.roles, source.path),
     )
 
 
-def _topic(topic: Topic, roles: Roles, log: Log) -> TopicSummary:
-    stamped = topic.has_column("sec") and topic.rows > 0
-    t_ns = np.sort(stamps(topic)[0] if stamped else topic.log_time())
-    rate, gap = _rate_and_gap(t_ns)
-    fed = tuple(s for s, source in roles.sensors.items() if source is topic and getattr(log, s) is not None)
+def _is_stamped(topic: Topic) -> bool:
+    return topic.has_column("sec") and topic.seen > 0
+
+
+def _topic(topic: Topic, reader: LogReader, steps: Steps) -> TopicSummary:
+    fed = tuple(s for s, source in reader.roles.sensors.items() if source is topic and reader.rows[s])
     return TopicSummary(
         name=topic.name,
         schema=topic.schema.name,
         encoding=topic.encoding,
         count=topic.count,
-        stamped=stamped,
-        first_ns=int(t_ns[0]) if len(t_ns) else None,
-        last_ns=int(t_ns[-1]) if len(t_ns) else None,
-        median_rate_hz=rate,
-        longest_gap_s=gap,
+        stamped=_is_stamped(topic),
+        first_ns=steps.first_ns,
+        last_ns=steps.last_ns,
+        median_rate_hz=steps.rate_hz() or float("nan"),
+        longest_gap_s=float("nan") if steps.longest_ns is None else steps.longest_ns / NS_PER_S,
         sensors=fed,
-        note="" if fed else _note(topic, roles),
+        note="" if fed else _note(topic, reader.roles),
     )
-
-
-def _rate_and_gap(t_ns: NDArray[np.int64]) -> tuple[float, float]:
-    """Median rate, Hz, and longest gap, s, of sorted times."""
-    steps = np.diff(t_ns)
-    if len(steps) == 0:
-        return float("nan"), float("nan")
-    median = float(np.median(steps))
-    return (NS_PER_S / median if median > 0 else float("nan")), float(steps.max()) / NS_PER_S
 
 
 def _note(topic: Topic, roles: Roles) -> str:

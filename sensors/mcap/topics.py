@@ -7,8 +7,7 @@ from sensors.errors import EgolocError
 from sensors.mcap.cdr import short_name
 from sensors.mcap.columns import Topic, Wanted
 from sensors.mcap.container import Definitions
-
-SENSORS = ("imu", "gnss", "gnss_velocity", "pose_fixes", "wheel", "reference")
+from sensors.pieces import SENSORS
 
 IMU = "sensor_msgs/Imu"
 NAV_SAT_FIX = "sensor_msgs/NavSatFix"
@@ -17,6 +16,7 @@ OLD_GPS_FIX = "gps_common/GPSFix"
 ODOMETRY = "nav_msgs/Odometry"
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 TWIST = "geometry_msgs/TwistWithCovarianceStamped"
+STRING = "std_msgs/String"
 
 MAP_FRAMES = frozenset({"map", "world"})
 """frame_id of poses in map coordinates."""
@@ -24,6 +24,9 @@ ENU_FRAMES = MAP_FRAMES | {"enu"}
 """frame_id of a twist that is a GNSS velocity."""
 BODY_FRAMES = frozenset({"body", "base_link", "base_footprint", "vehicle", "rear_axle"})
 """frame_id of a twist that is a wheel speed."""
+
+TAG_TOPICS = {"/scene": "scene", "/drive_mode": "mode"}
+"""Topics of strings that are tags without being named; all other strings may be anything."""
 
 _FEEDS = {
     IMU: ("imu",),
@@ -33,6 +36,7 @@ _FEEDS = {
     ODOMETRY: ("reference", "pose_fixes"),
     POSE: ("pose_fixes", "reference"),
     TWIST: ("gnss_velocity", "wheel"),
+    STRING: ("scene", "mode"),
 }
 """Schema -> sensors that it can feed."""
 _ON_REQUEST = {(ODOMETRY, "pose_fixes"), (POSE, "reference")}
@@ -107,6 +111,9 @@ def wanted_by(chosen: Mapping[str, str]) -> Callable[[str, str], Wanted | None]:
             for sensor in _FEEDS.get(schema, ())
             if sensor in named or (sensor not in chosen and (schema, sensor) not in _ON_REQUEST)
         ]
+        if schema == STRING:
+            mine = TAG_TOPICS.get(topic)
+            return Wanted({}, ("data",)) if named or (mine is not None and mine not in chosen) else None
         if not sensors:
             return None
         columns = {name: paths for sensor in sensors for name, paths in _COLUMNS[schema, sensor].items()}
@@ -124,11 +131,17 @@ class Roles:
     ignored: dict[str, str] = field(default_factory=dict)
 
 
-def assign(topics: Sequence[Topic], chosen: Mapping[str, str], definitions: Definitions, path: object) -> Roles:
-    """Give every sensor its topic. EgolocError where a chosen topic does not exist or cannot feed its sensor."""
+def assign(
+    topics: Sequence[Topic], chosen: Mapping[str, str], definitions: Definitions, path: object, *, complete: bool = True
+) -> Roles:
+    """Give every sensor its topic. EgolocError where a chosen topic does not exist or cannot feed its sensor.
+
+    complete: all topics are known; otherwise a chosen one may still come.
+    """
     roles = Roles()
     for sensor, name in chosen.items():
-        roles.sensors[sensor] = _named(topics, sensor, name, definitions, path)
+        if complete or any(channel.topic == name for channel in definitions.channels.values()):
+            roles.sensors[sensor] = _named(topics, sensor, name, definitions, path)
     offers: dict[str, list[Topic]] = {}
     for topic in topics:
         if topic.name not in chosen.values():
@@ -150,11 +163,12 @@ def assign(topics: Sequence[Topic], chosen: Mapping[str, str], definitions: Defi
     return roles
 
 
-def check_conflicts(roles: Roles, path: object) -> None:
-    """Raise where two topics could feed one sensor, naming both."""
+def conflict(roles: Roles, path: object) -> str:
+    """That two topics could feed one sensor, naming both; "" where none could."""
     for sensor, candidates in roles.conflicts.items():
         names = " and ".join(f"{topic.name} ({topic.schema.name})" for topic in candidates)
-        raise EgolocError(f"{path}: {sensor}: {names} could all feed it; name one under [topics]")
+        return f"{path}: {sensor}: {names} could all feed it; name one under [topics]"
+    return ""
 
 
 def _named(topics: Sequence[Topic], sensor: str, name: str, definitions: Definitions, path: object) -> Topic:
@@ -170,21 +184,31 @@ def _named(topics: Sequence[Topic], sensor: str, name: str, definitions: Definit
         raise EgolocError(f"{path}: topics.{sensor}: {name} has schema {schema}, expected one of {expected}")
     if found[0].unsupported:
         raise EgolocError(f"{path}: topics.{sensor}: {name}: {found[0].unsupported}")
-    return max(found, key=lambda topic: topic.rows)
+    return max(found, key=lambda topic: topic.seen)
+
+
+def is_plain_text(topic: Topic) -> bool:
+    """Whether a topic of strings is no tag; any log may have such topics."""
+    return short_name(topic.schema.name) == STRING and topic.wanted is None
 
 
 def _offer(topic: Topic) -> tuple[str, str]:
     """(sensor that a topic feeds, "") or ("", why it feeds none)."""
+    if is_plain_text(topic):
+        return "", f"strings are tags on {' and '.join(TAG_TOPICS)} or where they are named under [topics]"
     if topic.unsupported:
         return "", topic.unsupported
-    if topic.rows == 0:
+    if topic.first is None:
         return "", "no messages" if topic.count == 0 else "no readable message"
-    schema, frame = short_name(topic.schema.name), topic.frame
+    return _offer_by_frame(short_name(topic.schema.name), topic)
+
+
+def _offer_by_frame(schema: str, topic: Topic) -> tuple[str, str]:
     if schema == TWIST:
-        if frame in ENU_FRAMES | BODY_FRAMES:
-            return "gnss_velocity" if frame in ENU_FRAMES else "wheel", ""
+        if topic.frame in ENU_FRAMES | BODY_FRAMES:
+            return "gnss_velocity" if topic.frame in ENU_FRAMES else "wheel", ""
         names = f"{'/'.join(sorted(ENU_FRAMES))} (GNSS velocity) nor {'/'.join(sorted(BODY_FRAMES))} (wheel speed)"
-        return "", f"frame_id {frame!r} is neither {names}"
-    if schema in {ODOMETRY, POSE} and frame not in MAP_FRAMES:
-        return "", f"frame_id {frame!r} is not {' or '.join(sorted(MAP_FRAMES))}; name it under [topics] if it is"
-    return _FEEDS[schema][0], ""
+        return "", f"frame_id {topic.frame!r} is neither {names}"
+    if schema in {ODOMETRY, POSE} and topic.frame not in MAP_FRAMES:
+        return "", f"frame_id {topic.frame!r} is not {' or '.join(sorted(MAP_FRAMES))}; name it under [topics] if it is"
+    return TAG_TOPICS[topic.name] if schema == STRING else _FEEDS[schema][0], ""

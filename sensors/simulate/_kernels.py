@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sensors._kernels import EARTH_RATE, gravity_enu, radii
+from sensors._kernels import EARTH_RATE, WGS84_E2, gravity_enu, radii
 from sensors.kernel import kernel
 
 Floats = NDArray[np.float64]
@@ -35,55 +35,108 @@ def _with_slope(c: Any, z: float) -> tuple[float, float]:
     return p, d
 
 
+@kernel()
+def spline_pieces(control: Floats, spline: Floats, shape: Floats) -> None:
+    """Write the shape table (K, 4, 6) of quintic B-splines with control points (K + 5, 4); spline: (6, 6) powers."""
+    for k in range(len(shape)):
+        for column in range(4):
+            # around a nearby control point, so that a constant has exactly zero slope
+            near = control[k + 2, column]
+            for d in range(6):
+                power = 0.0
+                for j in range(6):
+                    power += (control[k + j, column] - near) * spline[j, d]
+                shape[k, column, d] = power
+            shape[k, column, 0] += near
+
+
 @kernel(allocates=True)
 def integrate_place(
-    shape: Floats, llh: Floats, step: float, nodes: Floats, weights: Floats, at_nodes: Floats, powers: Floats
-) -> Floats:
-    """The place table: lat' = vn/(RM+h), lon' = ve/((RN+h) cos lat), h' = vu by Gauss collocation on each interval.
+    shape: Floats,
+    knots: Floats,
+    step: float,
+    nodes: Floats,
+    weights: Floats,
+    at_nodes: Floats,
+    powers: Floats,
+    place: Floats,
+) -> None:
+    """Write the place table: lat' = vn/(RM+h), lon' = ve/((RN+h) cos lat), h' = vu by Gauss collocation on intervals.
 
-    at_nodes: (S, S) integrals from -1 to each node; powers: (S + 1, S) the same integrals as polynomials in z.
+    knots: (K + 1, 3) llh, the first given, the others written; at_nodes: (S, S) integrals from -1 to each node;
+    powers: (S + 1, S) the same integrals as polynomials in z; place: (K, 3, S + 1), empty where only knots are asked.
     """
-    count, stages = len(shape), len(nodes)
-    table = np.empty((count, 3, stages + 1))
+    stages = len(nodes)
     north, east, up = np.empty(stages), np.empty(stages), np.empty(stages)
-    lat_rate, lon_rate = np.empty(stages), np.empty(stages)
-    lat, lon, h = llh[0], llh[1], llh[2]
+    lat_rate, lon_rate, climb, change = np.empty(stages), np.empty(stages), np.empty(stages), np.empty(stages)
+    lat, lon, h = knots[0, 0], knots[0, 1], knots[0, 2]
     half = 0.5 * step
-    for k in range(count):
+    for k in range(len(shape)):
+        per_north, per_north_lat, per_north_h, per_east, tangent, per_east_lat2, per_east_h = _per_metre(lat, h)
         for g in range(stages):
             v = _value(shape[k, 0], nodes[g]) * half
             yaw = _value(shape[k, 1], nodes[g])
             grade = _value(shape[k, 2], nodes[g])
-            north[g] = v * math.cos(grade) * math.sin(yaw)
-            east[g] = v * math.cos(grade) * math.cos(yaw)
-            up[g] = v * math.sin(grade)
-        # the rates hardly depend on the place: each round gains six digits
-        lat_rate[:] = 0.0
-        for _ in range(3):
-            for g in range(stages):
-                lat_g, h_g = lat, h
-                for j in range(stages):
-                    lat_g += at_nodes[g, j] * lat_rate[j]
-                    h_g += at_nodes[g, j] * up[j]
-                meridian, transverse = radii(math.sin(lat_g))
-                lon_rate[g] = east[g] / ((transverse + h_g) * math.cos(lat_g))
-                north_g = north[g] / (meridian + h_g)
-                lat_rate[g] = north_g
-        for d in range(stages + 1):
-            a, b, c = 0.0, 0.0, 0.0
+            level = v * math.cos(grade)
+            north[g], east[g], up[g] = level * math.sin(yaw), level * math.cos(yaw), v * math.sin(grade)
+        for g in range(stages):
+            climb[g] = 0.0
             for j in range(stages):
-                a += powers[d, j] * lat_rate[j]
-                b += powers[d, j] * lon_rate[j]
-                c += powers[d, j] * up[j]
-            table[k, 0, d], table[k, 1, d], table[k, 2, d] = a, b, c
-        table[k, 0, 0] += lat
-        table[k, 1, 0] += lon
-        table[k, 2, 0] += h
+                climb[g] += at_nodes[g, j] * up[j]
+            lat_rate[g] = north[g] * (per_north + per_north_h * climb[g])
+        for g in range(stages):
+            moved = 0.0
+            for j in range(stages):
+                moved += at_nodes[g, j] * lat_rate[j]
+            lon_rate[g] = east[g] * (
+                per_east * (1.0 + moved * (tangent + moved * per_east_lat2)) + per_east_h * climb[g]
+            )
+            # the radius hardly changes with latitude: one round leaves 1e-15 of the way
+            change[g] = north[g] * per_north_lat * moved
+        for g in range(stages):
+            lat_rate[g] += change[g]
+        if len(place):
+            for d in range(stages + 1):
+                a, b, c = 0.0, 0.0, 0.0
+                for j in range(stages):
+                    a += powers[d, j] * lat_rate[j]
+                    b += powers[d, j] * lon_rate[j]
+                    c += powers[d, j] * up[j]
+                place[k, 0, d], place[k, 1, d], place[k, 2, d] = a, b, c
+            place[k, 0, 0] += lat
+            place[k, 1, 0] += lon
+            place[k, 2, 0] += h
         for j in range(stages):
             lat += weights[j] * lat_rate[j]
             lon += weights[j] * lon_rate[j]
             h += weights[j] * up[j]
-    return table
+        knots[k + 1, 0], knots[k + 1, 1], knots[k + 1, 2] = lat, lon, h
+
+
+@kernel(inline="always")
+def _per_metre(lat: float, h: float) -> tuple[float, float, float, float, float, float, float]:
+    """Series around a place of what a metre is worth: over an interval what is left out is 1e-13 of the way.
+
+    Latitude by metre north, its slopes by latitude and by height; longitude by metre east, its linear and quadratic
+    growth with latitude as a share of it, its slope by height.
+    """
+    sl, cl = math.sin(lat), math.cos(lat)
+    meridian, transverse = radii(sl)
+    per_north, tangent = 1.0 / (meridian + h), sl / cl
+    w2 = 1.0 - WGS84_E2 * sl * sl
+    bulge = WGS84_E2 * sl * cl / w2
+    per_radius = 1.0 / (transverse + h)
+    per_east = per_radius / cl
+    by_lat = tangent - transverse * bulge * per_radius
+    return (
+        per_north,
+        -3.0 * meridian * bulge * per_north * per_north,
+        -per_north * per_north,
+        per_east,
+        by_lat,
+        0.5 + tangent * tangent,
+        -per_radius * per_east,
+    )
 
 
 @kernel(allocates=True, inline="always")
@@ -154,13 +207,6 @@ def inertial_means(
 
 
 @kernel(allocates=True)
-def first_order(x: Floats, a: float) -> None:
-    """x[k] += a x[k-1], in place."""
-    for k in range(1, len(x)):
-        x[k] += a * x[k - 1]
-
-
-@kernel(allocates=True)
 def kinematics(
     shape: Floats, place: Floats, start: float, step: float, t: Floats, llh: Floats, vel_enu: Floats, q_enu_body: Floats
 ) -> None:
@@ -181,3 +227,11 @@ def kinematics(
         q_enu_body[i, 1] = cr * sp * cy + sr * cp * sy
         q_enu_body[i, 2] = cr * cp * sy - sr * sp * cy
         q_enu_body[i, 3] = cr * cp * cy + sr * sp * sy
+
+
+@kernel(allocates=True)
+def speeds(shape: Floats, start: float, step: float, t: Floats, speed: Floats) -> None:
+    """Write the speed along the vehicle's axis at times t (N,)."""
+    for i in range(len(t)):
+        k, z = _locate(t[i], start, step, len(shape))
+        speed[i] = _value(shape[k, 0], z)

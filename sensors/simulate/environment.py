@@ -3,11 +3,11 @@
 An environment's name is the scene tag that travels in the log. Rates add to what sensors do anywhere.
 """
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
-from sensors.bounds import Fraction, NonNegative, Positive
+from sensors.bounds import Finite, Fraction, NonNegative, Positive, check_order
 
 
 class Sky(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -45,6 +45,8 @@ class Landmarks(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 class Road(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How the road runs and is driven."""
 
+    on: Literal["streets", "highways", "any"] = "streets"
+    """Which roads of a network have such stretches: the streets of districts, the highways between them, or both."""
     speed_limits: Annotated[tuple[Positive, ...], msgspec.Meta(min_length=1)] = (8.3, 11.1, 13.9)
     """One is drawn for each road, m/s."""
     stop_probability: Fraction = 0.3
@@ -53,13 +55,15 @@ class Road(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """Steepest grade, m/m."""
     curve_radius_min_m: Positive = 60.0
     """Tightest curve between junctions, m."""
+    rise_m: Finite = 0.0
+    """Height over the ground in the middle of a block (bridge; negative: underpass), as far as grade_max allows, m."""
 
 
 class Environment(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One kind of stretch."""
 
     share: NonNegative = 1.0
-    """Its share of the network's kilometres, relative to the others'."""
+    """Its share of the network's kilometres, relative to the others'; 0: nowhere."""
     length_min_m: Positive = 100.0
     """Shortest stretch, m."""
     length_max_m: Positive = 2000.0
@@ -67,3 +71,6 @@ class Environment(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     road: Road = Road()
     sky: Sky = Sky()
     landmarks: Landmarks = Landmarks()
+
+    def __post_init__(self) -> None:
+        check_order(self, "length_min_m", "length_max_m")

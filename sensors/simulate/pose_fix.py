@@ -1,108 +1,119 @@
-"""Simulated EgoVM pose fixes: map x, y, yaw with the covariance that the errors are drawn with."""
+"""Simulated EgoVM pose fixes: map x, y, yaw with the covariance that a network would state."""
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from sensors.bounds import Fraction, NonNegative, Positive, check_order
+from sensors.clock import seconds
 from sensors.geodesy import MapFrame, map_from_llh
 from sensors.records import PoseFix
-from sensors.rotation import wrap, yaw_from_q
-from sensors.simulate.noise import Rng, correlated, delayed, gauss_markov
-from sensors.simulate.reference import attitude_in_map
+from sensors.rotation import wrap
+from sensors.simulate.course import Course
+from sensors.simulate.matching import MatchingHistory
+from sensors.simulate.noise import Delay, GaussMarkov, Rng, gauss_markov
+from sensors.simulate.pose_config import PoseFixSimulation
+from sensors.simulate.reference import yaw_in_map
 from sensors.simulate.trajectory import Motion
 from sensors.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
 
 GRID_M = 5.0
-"""Spacing at which the varying longitudinal sigma is drawn along the road."""
+"""Spacing at which sigmas and the errors bound to the place are drawn along the road."""
 
 
-class PoseFixSimulation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Map matching: sharp across the road, less so along it, blind along it where no landmark stands."""
+class PoseFixSensor:
+    """Map matching over one drive, some frames at a time.
 
-    use: bool = True
-    """Simulate pose fixes at all."""
-    rate_hz: Positive = 10.0
-    """Rate of the fixes, Hz."""
-    phase_s: NonNegative = 0.03
-    """First fix after the start (cameras do not share the IMU's clock), s."""
-    delay_s: NonNegative = 0.12
-    """From exposure to the fix's arrival, s."""
-    jitter_s: NonNegative = 0.003
-    """Standard deviation of that delay, s."""
-    longitudinal_min_m: Positive = 0.03
-    """Longitudinal sigma among many landmarks, m."""
-    longitudinal_max_m: Positive = 0.10
-    """Longitudinal sigma among few landmarks, m."""
-    longitudinal_scale_m: Positive = 80.0
-    """Distance over which the longitudinal sigma changes, m."""
-    lateral_m: Positive = 0.03
-    """Lateral sigma, m."""
-    yaw_deg: Positive = 0.13
-    """Yaw sigma, deg."""
-    blind_per_hour: NonNegative = 24.0
-    """How often the longitudinal direction is not observed, 1/h."""
-    blind_min_s: Positive = 3.0
-    """Shortest of these stretches, s."""
-    blind_max_s: Positive = 9.0
-    """Longest of these stretches, s."""
-    blind_sigma_min_m: Positive = 0.5
-    """Smallest longitudinal sigma there, m."""
-    blind_sigma_max_m: Positive = 0.9
-    """Largest longitudinal sigma there, m."""
-    correlated_fraction: Fraction = 0.3
-    """Share of each variance that is correlated in time (errors of the map); 0: white errors, -."""
-    correlation_s: NonNegative = 2.0
-    """Correlation time of that share, s."""
+    Without the events of MatchingHistory the stated covariance is the variance that the errors are drawn with: a share
+    from the map, one bound to the place in this drive, one correlated in time, the rest white. While the vehicle
+    stands, what is bound to the place stands still.
+    """
 
-    def __post_init__(self) -> None:
-        for name in ("longitudinal_{}_m", "blind_{}_s", "blind_sigma_{}_m"):
-            check_order(self, name.format("min"), name.format("max"))
+    def __init__(
+        self,
+        course: Course,
+        frame: MapFrame,
+        vehicle: Vehicle,
+        config: PoseFixSimulation,
+        rng: Rng,
+        *,
+        night: bool = False,
+    ) -> None:
+        """rng: its numbers go to what happens on the course, then to noise frame by frame."""
+        self._course, self._frame, self._vehicle, self._config = course, frame, vehicle, config
+        self._night = config.night_factor if night else 1.0
+        happening, slow, self._white, late, self._frames = rng.spawn(5)
+        self._history = MatchingHistory(course, config, happening)
+        nodes = int((course.s[-1] - course.s[0]) / GRID_M) + 2
+        self._nodes = course.s[0] + GRID_M * np.arange(nodes)
+        self._log_sigma = _log_sigmas(nodes, config, happening)
+        self._features = GaussMarkov(happening, 3, GRID_M, config.feature_scale_m).rows(nodes)
+        self._scarcity = np.array([e.landmarks.scarcity for e in course.environments])
+        self._slow = GaussMarkov(slow, 3, 1.0 / config.rate_hz, config.correlation_s)
+        self._delay = Delay(config.delay_s, config.jitter_s, late)
+
+    def sense(self, motion: Motion) -> PoseFix:
+        """Fixes of the vehicle's pose point; motion: truth at the next frames. Dropped frames are left out."""
+        config, t_ns = self._config, motion.t_ns
+        t, s = seconds(t_ns, self._course.t_ns[0]), self._course.place(t_ns)
+        sigma = self._sigmas(t, s)
+        error = sigma * self._unit_errors(s)
+        offset = np.radians(config.yaw_offset_deg)
+        error[:, 2] += offset
+        sigma[:, 2] = np.hypot(sigma[:, 2], offset)
+        self._history.upset(t, s, sigma, error)
+        dropped = (self._frames.random(len(t)) < config.dropped_fraction) | self._history.dropped(t)
+        place = map_from_llh(self._frame, motion.place_of(self._vehicle.pose_lever_arm))
+        yaw = yaw_in_map(motion, self._frame)
+        fixes = _fixes(t_ns, self._delay.arrivals(t_ns), place, yaw, sigma, error)
+        return fixes[~dropped] if dropped.any() else fixes
+
+    def _sigmas(self, t: Floats, s: Floats) -> Floats:
+        """(N, 3) m, m, rad, as the scene allows."""
+        sigma: Floats = np.exp(np.stack([np.interp(s, self._nodes, column) for column in self._log_sigma.T], axis=-1))
+        sigma[:, 0] *= self._scarcity[self._course.environment(s)]
+        sigma *= self._night
+        blind_sigma, blind = self._history.blind_sigma(t)
+        sigma[blind, 0] = blind_sigma[blind]
+        return sigma
+
+    def _unit_errors(self, s: Floats) -> Floats:
+        """(N, 3) of unit variance."""
+        config = self._config
+        timed, mapped, seen = config.correlated_fraction, config.map_fraction, config.feature_fraction
+        unit: Floats = np.sqrt(max(1.0 - timed - mapped - seen, 0.0)) * self._white.standard_normal((len(s), 3))
+        unit += np.sqrt(timed) * self._slow.rows(len(s))
+        if mapped:
+            unit += np.sqrt(mapped) * self._course.map_bias(s)
+        if seen:
+            features = [np.interp(s, self._nodes, column) for column in self._features.T]
+            unit += np.sqrt(seen) * np.stack(features, axis=-1)
+        return unit
 
 
-def simulate_pose_fixes(
-    motion: Motion, frame: MapFrame, vehicle: Vehicle, config: PoseFixSimulation, rng: Rng
+def _log_sigmas(nodes: int, config: PoseFixSimulation, rng: Rng) -> Floats:
+    """(nodes, 3) logarithm of the sigmas m, m, rad: longitudinal evenly between its ends, the others normal."""
+    low, high = np.log(config.longitudinal_min_m), np.log(config.longitudinal_max_m)
+    along = low + (high - low) * ndtr(gauss_markov(rng, nodes, GRID_M, config.longitudinal_scale_m))
+    spread = GaussMarkov(rng, 2, GRID_M, config.spread_scale_m).rows(nodes)
+    left = np.log(config.lateral_m) + config.lateral_spread * spread[:, 0]
+    yaw = np.log(np.radians(config.yaw_deg)) + config.yaw_spread * spread[:, 1]
+    return np.stack((along, left, yaw), axis=-1)
+
+
+def _fixes(
+    t_ns: NDArray[np.int64], arrival_ns: NDArray[np.int64], place: Floats, yaw: Floats, sigma: Floats, error: Floats
 ) -> PoseFix:
-    """Fixes of the vehicle's pose point at every time of motion, covariance aligned with the true heading."""
-    count, step_s = len(motion.t_ns), 1.0 / config.rate_hz
-    yaw = yaw_from_q(attitude_in_map(motion, frame))
-    sigmas = np.empty((count, 3))
-    sigmas[:, 0] = _longitudinal_sigma(motion, config, rng)
-    sigmas[:, 1], sigmas[:, 2] = config.lateral_m, np.radians(config.yaw_deg)
-    unit = [correlated(rng, count, step_s, config.correlation_s, config.correlated_fraction) for _ in range(3)]
-    axes = np.zeros((count, 3, 3))
-    axes[:, 0, 0] = axes[:, 1, 1] = np.cos(yaw)
-    axes[:, 1, 0] = np.sin(yaw)
-    axes[:, 0, 1] = -axes[:, 1, 0]
-    axes[:, 2, 2] = 1.0
-    pose = np.column_stack((map_from_llh(frame, motion.place_of(vehicle.pose_lever_arm))[:, :2], yaw))
-    pose += (axes @ (sigmas * np.stack(unit, axis=-1))[..., None])[..., 0]
-    pose[:, 2] = wrap(pose[:, 2])
-    root = axes * sigmas[:, None, :]
-    arrival_ns = delayed(motion.t_ns, config.delay_s, config.jitter_s, rng)
-    return PoseFix(motion.t_ns, arrival_ns, pose, root @ np.swapaxes(root, 1, 2))
-
-
-def _longitudinal_sigma(motion: Motion, config: PoseFixSimulation, rng: Rng) -> Floats:
-    """(N,) m: log-uniform along the road, much larger on blind stretches."""
-    seconds = (motion.t_ns - motion.t_ns[:1]) * 1e-9
-    moved = np.diff(seconds, prepend=0.0) * np.linalg.norm(motion.vel_enu, axis=1)
-    along = np.cumsum(moved)
-    nodes = int(along[-1] / GRID_M) + 2 if len(along) else 0
-    landmarks = gauss_markov(rng, nodes, GRID_M, config.longitudinal_scale_m)
-    scarcity = ndtr(np.interp(along, np.arange(nodes) * GRID_M, landmarks)) if nodes else along
-    sigma = config.longitudinal_min_m * (config.longitudinal_max_m / config.longitudinal_min_m) ** scarcity
-    for begin, end, blind_sigma in _blind_stretches(seconds[-1] if nodes else 0.0, config, rng):
-        sigma[(seconds >= begin) & (seconds < end)] = blind_sigma
-    return sigma
-
-
-def _blind_stretches(duration_s: float, config: PoseFixSimulation, rng: Rng) -> NDArray[np.float64]:
-    """(B, 3) begin s, end s and longitudinal sigma m of each stretch, at Poisson times."""
-    begin = np.sort(rng.random(rng.poisson(config.blind_per_hour * duration_s / 3600)) * duration_s)
-    length = rng.uniform(config.blind_min_s, config.blind_max_s, len(begin))
-    sigma = rng.uniform(config.blind_sigma_min_m, config.blind_sigma_max_m, len(begin))
-    return np.column_stack((begin, begin + length, sigma))
+    """Fixes with errors and sigmas (N, 3) along, left and in yaw of a vehicle at place (N, 3) with yaw (N,)."""
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    along, left, turn = error.T
+    x = place[:, 0] + cosine * along - sine * left
+    y = place[:, 1] + sine * along + cosine * left
+    variance = sigma**2
+    cov = np.zeros((len(t_ns), 3, 3))
+    cov[:, 0, 0] = cosine**2 * variance[:, 0] + sine**2 * variance[:, 1]
+    cov[:, 1, 1] = sine**2 * variance[:, 0] + cosine**2 * variance[:, 1]
+    cov[:, 0, 1] = cov[:, 1, 0] = cosine * sine * (variance[:, 0] - variance[:, 1])
+    cov[:, 2, 2] = variance[:, 2]
+    return PoseFix(t_ns, arrival_ns, np.stack((x, y, wrap(yaw + turn)), axis=-1), cov)

@@ -39,9 +39,27 @@ class Route:
         turned = np.concatenate(([0.0], np.cumsum(self.curvature * np.diff(self.edges))))
         return np.interp(s, self.edges, turned)
 
+    def place(self, s: Floats, heading: float = 0.0) -> Floats:
+        """(N, 2) m from the start to s (N,) in the plane; heading: rad at the start, ccw from the first axis."""
+        lengths = np.diff(self.edges)
+        turned = self.curvature * lengths
+        begins = heading + np.concatenate(([0.0], np.cumsum(turned)[:-1]))
+        corners = np.zeros((len(lengths), 2))
+        corners[1:] = np.cumsum(_chord(lengths, turned, begins), axis=0)[:-1]
+        at = self.element(s)
+        into = s - self.edges[at]
+        return corners[at] + _chord(into, self.curvature[at] * into, begins[at])
+
     def element(self, s: Floats) -> NDArray[np.intp]:
         """(N,) index of the element at s."""
         return np.clip(np.searchsorted(self.edges, s, side="right") - 1, 0, len(self.curvature) - 1)
+
+
+def _chord(length: Floats, turned: Floats, begin: Floats) -> Floats:
+    """(N, 2) m from begin to end of arcs of a length m that turn by an angle rad from their heading at the begin."""
+    straight = length * np.sinc(turned / (2 * np.pi))
+    middle = begin + turned / 2
+    return np.stack((straight * np.cos(middle), straight * np.sin(middle)), axis=-1)
 
 
 class CityPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 from fusion.alignment import Initial
 from fusion.config import Alignment, FusionConfig, Gates, GnssModel, ImuNoise, MotionModel, PoseModel
 from fusion.events import Events, Measurements, Recorder, new_recorder
+from fusion.navigator import feed, start
 from fusion.result import Sensor
-from fusion.run import feed, start
-from fusion.state import ACCEL_BIAS, E_ATTITUDE, E_VELOCITY, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core
-from fusion.timeline import APPLY, merge, parameters, sources
+from fusion.sources import APPLY, sources
+from fusion.state import ACCEL_BIAS, E_ATTITUDE, E_VELOCITY, ERROR_SIZE, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core
+from fusion.timeline import merge, parameters
 from sensors._kernels import EARTH_RATE, gravity_enu
 from sensors.geodesy import ecef_from_llh, meridian_radius, transverse_radius
 from sensors.records import Imu, Log
@@ -25,7 +26,8 @@ Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
 FREE = FusionConfig(
-    imu=ImuNoise(noise_scale=1.0, max_gap_s=0.5), motion=MotionModel(zero_velocity=False, non_holonomic=False)
+    imu=ImuNoise(noise_scale=1.0, max_gap_s=0.5),
+    motion=MotionModel(zero_velocity=False, non_holonomic=False, wheel_scale_sigma=0.0, wheel_scale_walk=0.0),
 )
 """Nothing but what the log holds."""
 HONEST = FusionConfig(
@@ -58,6 +60,8 @@ HONEST = FusionConfig(
         still_max_speed=0.3,
         zero_velocity_sigma=0.03,
         zero_rate_sigma_deg=0.1,
+        wheel_scale_sigma=0.0,
+        wheel_scale_walk=0.0,
     ),
     gates=Gates(probability=0.9999),
     alignment=Alignment(window_s=1.0, min_course_speed=3.0, course_sigma_deg=2.0, level_sigma_deg=1.0),
@@ -81,7 +85,7 @@ def exact_imu(truth: Truth, t_ns: Nanoseconds, vehicle: Vehicle) -> Imu:
 
 
 def at_rest(nav: Floats, t_ns: Nanoseconds, push: Floats | None = None) -> Imu:
-    """Exact samples of a body that keeps its attitude to the local axes, with the biases of nav (16,).
+    """Exact samples of a body that keeps its attitude to the local axes, with the biases of nav (17,).
 
     push: (3,) m/s^2 on top of gravity's reaction over the first third.
     """
@@ -96,13 +100,13 @@ def at_rest(nav: Floats, t_ns: Nanoseconds, push: Floats | None = None) -> Imu:
 
 
 def nav_of(motion: Motion, row: int = 0) -> Floats:
-    """(16,) nominal state of a true motion, biases zero."""
-    return np.concatenate((motion.llh[row], motion.vel_enu[row], motion.q_enu_body[row], np.zeros(6)))
+    """(17,) nominal state of a true motion, biases and wheel scale zero."""
+    return np.concatenate((motion.llh[row], motion.vel_enu[row], motion.q_enu_body[row], np.zeros(7)))
 
 
 def core_at(nav: Floats, imu: Imu, P: Floats | None = None, row: int = 0) -> Core:
-    """A core at sample row of imu; P (15, 15), zeros if not given."""
-    cov = np.zeros((15, 15)) if P is None else P
+    """A core at sample row of imu; P (16, 16), zeros if not given."""
+    cov = np.zeros((ERROR_SIZE, ERROR_SIZE)) if P is None else P
     return start(Initial(int(imu.t_ns[row]), nav.copy(), cov.copy(), Sensor.POSE_FIX), imu)
 
 
@@ -142,18 +146,18 @@ def nothing(vehicle: Vehicle) -> tuple[Events, Measurements, Recorder]:
 
 
 def plus(nav: Floats, dx: Floats) -> Floats:
-    """Plain numpy: nav (16,) moved by the error dx (15,), metres to radians there, attitude on the left."""
+    """Plain numpy: nav (17,) moved by the error dx (16,), metres to radians there, attitude on the left."""
     moved = nav.copy()
     meridian, transverse = float(meridian_radius(nav[0])) + nav[2], float(transverse_radius(nav[0])) + nav[2]
     moved[LLH] += np.array([dx[1] / meridian, dx[0] / (transverse * np.cos(nav[0])), dx[2]])
     moved[VELOCITY] += dx[E_VELOCITY]
     moved[QUATERNION] = (Rotation.from_rotvec(dx[E_ATTITUDE]) * Rotation.from_quat(nav[QUATERNION])).as_quat()
-    moved[10:] += dx[9:15]
+    moved[10:] += dx[9:]
     return moved
 
 
 def minus(a: Floats, b: Floats) -> Floats:
-    """(15,) error that ``plus`` adds to b to get a (to first order in position)."""
+    """(16,) error that ``plus`` adds to b to get a (to first order in position)."""
     meridian, transverse = float(meridian_radius(b[0])) + b[2], float(transverse_radius(b[0])) + b[2]
     dlat, dlon, up = a[LLH] - b[LLH]
     turn = (Rotation.from_quat(a[QUATERNION]) * Rotation.from_quat(b[QUATERNION]).inv()).as_rotvec()

@@ -10,7 +10,7 @@ from fusion.covariance import Noise, coast, propagate, transition
 from fusion.events import OUTPUT
 from fusion.filter import Localizer
 from fusion.run import run
-from fusion.state import A_S, E_ATTITUDE, E_POSITION, E_VELOCITY, ERROR_SIZE, ROW, covariance
+from fusion.state import A_S, E_ATTITUDE, E_POSITION, E_VELOCITY, E_WHEEL_SCALE, ERROR_SIZE, ROW
 from fusion.timeline import noise_of
 from sensors.simulate import scenarios
 from sensors.simulate.drive import simulate
@@ -31,13 +31,15 @@ from tests.fusion.free import (
 )
 from tests.fusion.scenes import with_gap
 
-SIGMAS = np.repeat([1.0, 0.1, 0.02, 1e-4, 0.05], 3)
-NOISE = Noise(gyro_psd=1e-6, accel_psd=1e-4, gyro_bias_var=1e-8, accel_bias_var=1e-6, bias_rate=0.01)
+SIGMAS = np.append(np.repeat([1.0, 0.1, 0.02, 1e-4, 0.05], 3), 0.01)
+NOISE = Noise(
+    gyro_psd=1e-6, accel_psd=1e-4, gyro_bias_var=1e-8, accel_bias_var=1e-6, bias_rate=0.01, wheel_scale_rate=1e-7
+)
 
 
 def plain(P: Floats, phi: Floats, force: Floats, span: float, noise: Noise) -> Floats:
-    """Phi P Phi' + Q in numpy. phi: (15, 15); force: (3,) integral of the specific force, ENU m/s."""
-    Q = np.zeros((15, 15))
+    """Phi P Phi' + Q in numpy. phi: (16, 16); force: (3,) integral of the specific force, ENU m/s."""
+    Q = np.zeros((16, 16))
     qa, qg = noise.accel_psd * span, noise.gyro_psd * span
     x, y, z = force
     minus_skew = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
@@ -47,7 +49,8 @@ def plain(P: Floats, phi: Floats, force: Floats, span: float, noise: Noise) -> F
     Q[E_ATTITUDE, E_ATTITUDE] = np.eye(3) * qg
     Q[E_VELOCITY, E_ATTITUDE] = minus_skew * qg / 2
     Q[E_ATTITUDE, E_VELOCITY] = minus_skew.T * qg / 2
-    Q[9:, 9:] = np.diag(np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3)) * 2 * noise.bias_rate * span
+    Q[9:15, 9:15] = np.diag(np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3)) * 2 * noise.bias_rate * span
+    Q[E_WHEEL_SCALE, E_WHEEL_SCALE] = noise.wheel_scale_rate * span
     result: Floats = phi @ P @ phi.T + Q
     return result
 
@@ -62,15 +65,14 @@ def test_propagation_equals_plain_matrices() -> None:
     assert core.span[0] == pytest.approx(0.1, abs=1e-12)
     upper = np.zeros((9, ROW))
     transition(core.nav, core.earth, core.acc, core.span[0], upper)
-    phi = np.eye(15)
-    phi[:9] = upper[:, :15]
+    phi = np.eye(ERROR_SIZE)
+    phi[:9] = upper
     expected = plain(P, phi, core.acc[A_S].copy(), 0.1, NOISE)
     propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), NOISE)
-    assert np.abs(covariance(core) - expected).max() < 1e-14 * np.abs(expected).max()
-    assert np.abs((covariance(core) - expected) / np.outer(SIGMAS, SIGMAS)).max() < 1e-11
+    assert np.abs(core.P - expected).max() < 1e-14 * np.abs(expected).max()
+    assert np.abs((core.P - expected) / np.outer(SIGMAS, SIGMAS)).max() < 1e-11
     assert core.span[0] == 0.0
     assert (core.acc == 0.0).all()
-    assert (core.P[:, ERROR_SIZE:] == 0.0).all()
 
 
 def van_loan(F: Floats, G: Floats, span: float) -> Floats:
@@ -93,7 +95,7 @@ def test_process_noise_is_the_integral_of_white_noise() -> None:
     F[3:6, 6:9] = [[0, f[2], -f[1]], [-f[2], 0, f[0]], [f[1], -f[0], 0]]
     G = np.diag(np.repeat([0.0, noise.accel_psd, noise.gyro_psd], 3))
     expected = van_loan(F, G, span)
-    Q = plain(np.zeros((15, 15)), np.eye(15), f * span, span, noise)[:9, :9]
+    Q = plain(np.zeros((16, 16)), np.eye(16), f * span, span, noise)[:9, :9]
     sigma = np.sqrt(np.diag(expected))
     missing = np.abs((Q - expected) / np.outer(sigma, sigma))
     # left out: position against attitude, a correlation of g t sqrt(qg / 12 qa) = 1 %
@@ -122,7 +124,7 @@ def test_free_sigmas_do_not_depend_on_the_rate() -> None:
         imu = exact_imu(truth, t, vehicle)
         core = core_at(nav_of(truth.at(t[:1])), imu, P)
         go(core, imu, vehicle)
-        sigma[hz] = np.sqrt(np.diag(covariance(core)))
+        sigma[hz] = np.sqrt(np.diag(core.P))
     assert np.abs(sigma[200] / sigma[100] - 1).max() < 1e-3
 
 
@@ -135,7 +137,7 @@ def test_sigmas_do_not_depend_on_how_often_p_is_used() -> None:
     for hz in (1, 10, 100):
         core = core_at(nav_of(truth.at(t[:1])), imu, np.diag((0.01 * SIGMAS) ** 2))
         go(core, imu, vehicle, msgspec.structs.replace(FREE, output_hz=float(hz)))
-        sigma[hz] = np.sqrt(np.diag(covariance(core)))
+        sigma[hz] = np.sqrt(np.diag(core.P))
     assert np.abs(sigma[10] / sigma[100] - 1).max() < 1e-3
     assert np.abs(sigma[1] / sigma[100] - 1).max() < 1e-2
 
@@ -158,7 +160,7 @@ def test_p_stays_symmetric_and_positive_definite_for_an_hour() -> None:
 
 
 def test_whole_covariance_is_positive_definite_after_ten_minutes() -> None:
-    """The full 15 x 15 at its end, through the streaming filter, which shows it."""
+    """The full 16 x 16 at its end, through the streaming filter, which shows it."""
     log = simulate(600.0, 12, scenarios.load("demo"))
     localizer = Localizer(log.vehicle, log.map_frame, FusionConfig())
     for record in (log.gnss, log.gnss_velocity, log.pose_fixes, log.imu):
@@ -174,12 +176,12 @@ def test_whole_covariance_is_positive_definite_after_ten_minutes() -> None:
 
 @pytest.mark.parametrize("parts", [2, 7, 300])
 def test_coasting_does_not_depend_on_how_a_gap_is_split(parts: int) -> None:
-    whole, split = (np.pad(random_covariance(3, SIGMAS), ((0, 0), (0, ROW - 15))) for _ in range(2))
+    whole, split = (random_covariance(3, SIGMAS) for _ in range(2))
     coast(whole, 3.0, 2.0, 0.3)
     for _ in range(parts):
         coast(split, 3.0 / parts, 2.0, 0.3)
     assert np.abs(whole - split).max() < 1e-9 * np.abs(whole).max()
-    assert np.abs(whole[:, :15] - whole[:, :15].T).max() < 1e-12 * np.abs(whole).max()
+    assert np.abs(whole - whole.T).max() < 1e-12 * np.abs(whole).max()
 
 
 def ends_of_a_gap(samples: int) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -193,7 +195,7 @@ def ends_of_a_gap(samples: int) -> list[tuple[NDArray[np.float64], NDArray[np.fl
     for at in (np.empty(0, np.int64), inside):
         core = core_at(nav_of(truth.at(t[:1])), imu, np.diag(SIGMAS**2))
         go_with(core, imu[:1001], vehicle, np.sort(np.append(at, t[1000])), OUTPUT)
-        ends.append((core.nav.copy(), np.sqrt(np.diag(covariance(core)))))
+        ends.append((core.nav.copy(), np.sqrt(np.diag(core.P))))
     return ends
 
 
@@ -231,5 +233,5 @@ def test_waiting_makes_no_bias_known() -> None:
     core = core_at(nav_of(truth.at(t[:1])), imu, np.diag(SIGMAS**2))
     go(core, imu, vehicle)
     noise = noise_of(vehicle.imu, FREE.imu.noise_scale)
-    grown = SIGMAS[9:] ** 2 + np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3) * 2 * 600 * noise.bias_rate
-    assert np.diag(covariance(core))[9:] == pytest.approx(grown, rel=1e-9)
+    grown = SIGMAS[9:15] ** 2 + np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3) * 2 * 600 * noise.bias_rate
+    assert np.diag(core.P)[9:15] == pytest.approx(grown, rel=1e-9)

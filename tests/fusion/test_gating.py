@@ -28,14 +28,14 @@ SEEN = np.array([0.05, 0.03, 0.002])
 def reduced(R: Floats, residual: Floats, H: Floats) -> tuple[int, Floats, Floats, Floats]:
     """Directions kept, and R, residual and H after the covariance gate."""
     r, z, h = R.copy(), residual.copy(), np.zeros((3, ROW))
-    h[:, :15] = H
+    h[:] = H
     kept = observed_directions(h, r, z, LIMITS, np.zeros((2, 3, 3)), np.zeros((3, ROW)))
-    return kept, r, z, h[:, :15]
+    return kept, r, z, h
 
 
 def rows() -> Floats:
-    """H (3, 15) of a pose fix that looks at position and attitude."""
-    H = np.zeros((3, 15))
+    """H (3, 16) of a pose fix that looks at position and attitude."""
+    H = np.zeros((3, ROW))
     H[:, :9] = np.random.default_rng(1).standard_normal((3, 9))
     return H
 
@@ -85,7 +85,7 @@ def test_rank_reduced_update_equals_infinite_variance(seed: int, dropped: int) -
     blind = np.where(values > 1.0, 1e9, values)
     R_blind = D @ axes @ np.diag(blind) @ axes.T @ D
     z, H = np.array([0.2, -0.1, 0.003]), rows()
-    P = random_covariance(seed + 10, np.repeat([0.2, 0.1, 0.01, 1e-4, 0.05], 3))
+    P = random_covariance(seed + 10, np.append(np.repeat([0.2, 0.1, 0.01, 1e-4, 0.05], 3), 0.01))
     kept, r, residual, h = reduced(R, z, H)
     assert kept == 3 - dropped
     dx, after = corrected(P, h[:kept], r[:kept, :kept], residual[:kept])
@@ -126,14 +126,13 @@ def test_thresholds_follow_probability_and_degrees_of_freedom(dof: int) -> None:
 @pytest.mark.parametrize("dof", [1, 2, 3])
 def test_consistent_innovations_pass_at_the_stated_probability(dof: int) -> None:
     """20,000 draws from N(0, H P H' + R) against the 95 % threshold: within four standard deviations of 95 %."""
-    P, H, rng = np.zeros((15, ROW)), np.zeros((3, ROW)), np.random.default_rng(dof)
-    P[:, :15] = random_covariance(4, np.ones(15))
-    H[:dof, :15] = rng.standard_normal((dof, 15))
+    P, H, rng = random_covariance(4, np.ones(ROW)), np.zeros((3, ROW)), np.random.default_rng(dof)
+    H[:dof] = rng.standard_normal((dof, ROW))
     R = np.zeros((3, 3))
     R[:dof, :dof] = random_covariance(5, np.ones(dof))
     W, L = np.zeros((3, ROW)), np.zeros((3, 3))
     assert innovate(P, H, W, dof, R, L)
-    S = H[:dof, :15] @ P[:, :15] @ H[:dof, :15].T + R[:dof, :dof]
+    S = H[:dof] @ P @ H[:dof].T + R[:dof, :dof]
     draws = rng.multivariate_normal(np.zeros(dof), S, 20_000)
     scores = np.array([whiten(dof, np.append(z, np.full(3 - dof, 7.0)), L) for z in draws])
     passed = float((scores <= chi2.ppf(0.95, dof)).mean())

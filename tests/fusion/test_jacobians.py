@@ -11,10 +11,10 @@ from fusion._linalg import attitude
 from fusion.covariance import transition
 from fusion.events import OUTPUT
 from fusion.gating import inject, reset
-from fusion.measurements import body_velocity, gnss_position, gnss_velocity, pose_fix, yaw_row
+from fusion.measurements import body_velocity, gnss_position, gnss_velocity, pose_fix, wheel_speed, yaw_row
 from fusion.measurements import wrap as wrap_kernel
-from fusion.state import E_ATTITUDE, GYRO_BIAS, LLH, QUATERNION, ROW, VELOCITY
-from fusion.timeline import pose_columns
+from fusion.sources import pose_columns
+from fusion.state import E_ATTITUDE, E_WHEEL_SCALE, ERROR_SIZE, GYRO_BIAS, LLH, QUATERNION, ROW, VELOCITY, WHEEL_SCALE
 from sensors.geodesy import MapFrame, map_from_llh, utm_frame
 from sensors.records import Imu, PoseFix
 from sensors.rotation import matrix_from_q, q_from_rpy, yaw_from_q
@@ -25,9 +25,9 @@ from tests.fusion.free import HONEST, core_at, go_with, minus, plus
 
 Floats = NDArray[np.float64]
 
-SCALE = np.repeat([1.0, 0.1, 1e-3, 1e-5, 1e-2], 3)
-"""Errors of ordinary size: m, m/s, rad, rad/s, m/s^2. Jacobians are compared in these units."""
-BIASES = [1e-3, -2e-3, 1.5e-3, 0.02, -0.03, 0.05]
+SCALE = np.append(np.repeat([1.0, 0.1, 1e-3, 1e-5, 1e-2], 3), 1e-3)
+"""Errors of ordinary size: m, m/s, rad, rad/s, m/s^2, -. Jacobians are compared in these units."""
+BIASES = [1e-3, -2e-3, 1.5e-3, 0.02, -0.03, 0.05, 0.004]
 NAV = np.concatenate(([0.84, 0.2, 560.0], [18.0, -12.0, 1.5], q_from_rpy(0.12, -0.08, 2.3)[0], BIASES))
 GYRO = np.array([0.11, -0.07, 0.45])
 ARM = (0.9, -0.6, 1.3)
@@ -45,19 +45,19 @@ def shaken(seconds: float) -> Imu:
 
 
 def propagated(imu: Imu, nav: Floats) -> tuple[Floats, Floats]:
-    """State (16,) after the samples and the transition (9, 15) that was summed over them."""
+    """State (17,) after the samples and the transition (9, 16) that was summed over them."""
     core = core_at(nav, imu)
     go_with(core, imu, Vehicle(), NONE, OUTPUT)
     phi = np.zeros((9, ROW))
     transition(core.nav, core.earth, core.acc, core.span[0], phi)
-    return core.nav, phi[:, :15]
+    return core.nav, phi
 
 
 def transitions(seconds: float, size: float) -> tuple[Floats, Floats]:
-    """The filter's transition and that of central differences of the strapdown (9, 15), in units of SCALE."""
+    """The filter's transition and that of central differences of the strapdown (9, 16), in units of SCALE."""
     imu = shaken(seconds)
     nominal, phi = propagated(imu, NAV)
-    found = np.empty((9, 15))
+    found = np.empty((9, ERROR_SIZE))
     for i, step in enumerate(np.diag(size * SCALE)):
         ahead, behind = (propagated(imu, plus(NAV, sign * step))[0] for sign in (1.0, -1.0))
         found[:, i] = (minus(ahead, nominal) - minus(behind, nominal))[:9] / (2 * size)
@@ -65,8 +65,9 @@ def transitions(seconds: float, size: float) -> tuple[Floats, Floats]:
 
 
 def blocks(a: Floats) -> Floats:
-    """(3, 5) largest magnitude of each 3 x 3 block."""
-    result: Floats = np.abs(a).reshape(3, 3, 5, 3).max(axis=(1, 3))
+    """(3, 5) largest magnitude of each 3 x 3 block; the wheel scale moves nothing."""
+    assert (a[:, E_WHEEL_SCALE] == 0.0).all()
+    result: Floats = np.abs(a[:, :E_WHEEL_SCALE]).reshape(3, 3, 5, 3).max(axis=(1, 3))
     return result
 
 
@@ -135,6 +136,13 @@ def rear_axle(true: Floats, H: Floats) -> Floats:
     return np.asarray(seen - np.array(body_velocity(NAV, attitude(NAV), H, ARM, rate())))
 
 
+def wheel(true: Floats, H: Floats) -> Floats:
+    R = matrix_from_q(true[QUATERNION])
+    seen = R.T @ true[VELOCITY] + np.cross(GYRO - true[GYRO_BIAS], ARM)
+    speed = float(seen[0] * (1.0 + true[WHEEL_SCALE]))
+    return np.array([wheel_speed(NAV, attitude(NAV), H, speed, ARM, rate()), 0.0, 0.0])
+
+
 def fix_in(frame: MapFrame) -> Residual:
     """A pose fix in a map frame, by the simulator's path into the map and the filter's path back."""
 
@@ -167,14 +175,15 @@ SENSORS: dict[str, tuple[Residual, float, float]] = {
     "gnss velocity": (velocity, 1e-12, 2e-7),  # the earth's rate times the lever arm's turn is left out
     "gnss yaw": (yaw, 1e-12, 1e-8),
     "rear axle": (rear_axle, 1e-12, 1e-8),  # differences: 22 m/s (1e-3 rad)^3 / 6
+    "wheel": (wheel, 1e-12, 2e-4),  # differences: the product of both errors is of second order
     "pose fix in UTM": (fix_in(UTM), 1e-6, 1e-4),  # map metres are metres on the ellipsoid, 560 m below
     "pose fix in a far ENU plane": (fix_in(FAR_PLANE), 4.5e-4, 1e-5),  # yaw: tilt times pitch is left out
 }
 
 
 def differences(residual: Residual, size: float) -> Floats:
-    """(3, 15) central differences of a residual against errors of size times SCALE, per SCALE."""
-    found, scratch = np.empty((3, 15)), np.zeros((3, ROW))
+    """(3, 16) central differences of a residual against errors of size times SCALE, per SCALE."""
+    found, scratch = np.empty((3, ERROR_SIZE)), np.zeros((3, ROW))
     for i, step in enumerate(np.diag(size * SCALE)):
         ahead, behind = residual(plus(NAV, step), scratch), residual(plus(NAV, -step), scratch)
         found[:, i] = (ahead - behind) / (2 * size)
@@ -186,10 +195,10 @@ def test_measurement_jacobian(name: str) -> None:
     residual, exact, tolerance = SENSORS[name]
     H = np.zeros((3, ROW))
     assert np.abs(residual(NAV, H)).max() <= exact
-    assert (H[:, 15] == 0.0).all()
-    assert (np.abs(H[:, :15]).max(axis=1) > 0.1).sum() == (1 if name == "gnss yaw" else 3)
+    assert (H[0, E_WHEEL_SCALE] != 0.0) == (name == "wheel")
+    assert (np.abs(H).max(axis=1) > 0.1).sum() == (1 if name in ("gnss yaw", "wheel") else 3)
     for size in (1.0, 1e-4):
-        difference = np.abs(H[:, :15] * SCALE - differences(residual, size))
+        difference = np.abs(H * SCALE - differences(residual, size))
         assert difference.max() <= tolerance + ROUNDING / size, difference
 
 
@@ -198,7 +207,7 @@ def test_yaw_residual_takes_the_short_way_round() -> None:
     H = np.zeros((3, ROW))
     predicted = yaw_row(attitude(nav), H, 0)
     assert wrap_kernel(-np.pi + 1e-4 - predicted) == pytest.approx(2e-4, abs=1e-12)
-    turned = plus(nav, np.array([0.0] * 8 + [3e-4] + [0.0] * 6))
+    turned = plus(nav, np.array([0.0] * 8 + [3e-4] + [0.0] * 7))
     assert wrap_kernel(yaw_from_q(turned[QUATERNION]) - predicted) == pytest.approx(3e-4, abs=1e-9)
     still_there = differences_of_yaw(nav)
     assert np.abs(H[0, 6:9] - still_there).max() < 1e-8
@@ -208,7 +217,7 @@ def differences_of_yaw(nav: Floats) -> Floats:
     """(3,) change of yaw per rad of attitude error, across +-pi where nav lies there."""
     found = np.empty(3)
     for i in range(3):
-        step = np.zeros(15)
+        step = np.zeros(ERROR_SIZE)
         step[6 + i] = 5e-4
         ahead, behind = (float(yaw_from_q(plus(nav, sign * step)[QUATERNION])) for sign in (1.0, -1.0))
         found[i] = ((ahead - behind + np.pi) % (2 * np.pi) - np.pi) / 1e-3
@@ -222,8 +231,8 @@ def test_injection_adds_the_error(size: float) -> None:
     core = core_at(NAV, shaken(0.1))
     for _ in range(5):
         dx = np.zeros(ROW)
-        dx[:15] = size * SCALE * rng.standard_normal(15)
-        expected = plus(core.nav, dx[:15])
+        dx = size * SCALE * rng.standard_normal(ROW)
+        expected = plus(core.nav, dx)
         inject(core.nav, core.earth, dx)
         difference = minus(core.nav, expected) / SCALE
         assert np.abs(difference).max() < 1e-6 * size + ROUNDING
@@ -243,13 +252,13 @@ def test_reset_jacobian(size: float) -> None:
     """The kernel's G is of first order: what it leaves out is |b|^2 / 6."""
     b = size * np.array([0.6, -0.5, np.sqrt(1 - 0.61)])
     root = np.random.default_rng(2).standard_normal((15, 15))
-    P = np.zeros((15, ROW))
-    P[:, :15] = cov = root @ root.T
+    cov = np.zeros((ROW, ROW))
+    cov[:15, :15] = root @ root.T
+    P = cov.copy()
     reset(P, (0.5 * b[0], 0.5 * b[1], 0.5 * b[2]))
-    G = np.eye(15)
+    G = np.eye(ROW)
     G[E_ATTITUDE, E_ATTITUDE] = reset_jacobian(b)
     allowed = (size**2 / 6 + 1e-9) * np.abs(cov).max() * 4
-    assert np.abs(P[:, :15] - G @ cov @ G.T).max() < allowed
+    assert np.abs(P - G @ cov @ G.T).max() < allowed
     if size > 1e-3:  # leaving the reset out would show
         assert np.abs(cov - G @ cov @ G.T).max() > 3 * allowed
-    assert (P[:, 15] == 0.0).all()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion.events import OUTPUT
-from fusion.run import feed
+from fusion.navigator import feed
 from fusion.timeline import parameters
 from sensors._kernels import EARTH_RATE, gravity_enu
 from sensors.geodesy import ecef_from_llh
@@ -129,7 +129,7 @@ def test_coning_is_followed_at_fourth_order(samples: Samples) -> None:
     drift = []
     for hz in (50, 100, 200):
         imu, attitude = coning(samples, hz, 60)
-        core = core_at(np.concatenate((PLACE, np.zeros(3), attitude[0].as_quat(), np.zeros(6))), imu)
+        core = core_at(np.concatenate((PLACE, np.zeros(3), attitude[0].as_quat(), np.zeros(7))), imu)
         go(core, imu, vehicle(samples))
         error = (Rotation.from_quat(core.nav[6:10]) * attitude[-1].inv()).as_rotvec()
         drift.append(abs(np.degrees(error[2])))

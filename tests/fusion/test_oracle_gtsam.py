@@ -32,12 +32,12 @@ def filtered(log: Log, nav: Floats) -> tuple[Floats, Floats]:
     """(N, 3) ENU positions and sigmas of the kernel filter after every GNSS epoch, from a given first state."""
     assert log.imu is not None
     order = ("position", "velocity", "attitude", "gyro bias", "accel bias")
-    P = np.diag(np.repeat([PRIOR[name] for name in order], 3) ** 2)
+    P = np.diag(np.append(np.repeat([PRIOR[name] for name in order], 3), 0.0) ** 2)
     core = core_at(nav, log.imu, P)
     config = msgspec.structs.replace(HONEST_FREE, gates=Gates(use=False), output_hz=10.0)
     rec, _ = go(core, log.imu, log.vehicle, config, log)
     n = int(rec.filled[0])
-    assert rec.sigma_state.shape[1] == ERROR_SIZE
+    assert rec.sigma_state.shape[1] == ERROR_SIZE - 1
     return enu_from_llh(rec.nav[:n, :3], nav[:3]), rec.sigma_state[:n, :3]
 
 

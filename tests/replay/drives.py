@@ -94,16 +94,16 @@ def states(t_ns: Nanoseconds, error: tuple[float, float, float] = (0.0, 0.0, 0.0
 
 
 def decisions(log: Log) -> Decisions:
-    """One accepted decision per GNSS position and pose fix, in stamp order."""
+    """One accepted decision per GNSS position and velocity and per pose fix, in the order in which they were true."""
     parts = [
-        (Sensor.GNSS_POSITION, log.gnss),
-        (Sensor.GNSS_VELOCITY, log.gnss_velocity),
-        (Sensor.POSE_FIX, log.pose_fixes),
+        (Sensor.GNSS_POSITION, log.gnss, log.vehicle.gnss_delay_s),
+        (Sensor.GNSS_VELOCITY, log.gnss_velocity, log.vehicle.gnss_velocity_delay_s),
+        (Sensor.POSE_FIX, log.pose_fixes, 0.0),
     ]
-    known = [(sensor, record) for sensor, record in parts if record is not None]
-    t_ns = np.concatenate([np.empty(0, np.int64), *(record.t_ns for _, record in known)])
-    sensor = np.concatenate([np.empty(0, np.int8), *(np.full(len(record), s, np.int8) for s, record in known)])
-    row = np.concatenate([np.empty(0, np.int64), *(np.arange(len(record)) for _, record in known)])
+    known = [(sensor, record, round(delay * NS_PER_S)) for sensor, record, delay in parts if record is not None]
+    t_ns = np.concatenate([np.empty(0, np.int64), *(record.t_ns - delay for _, record, delay in known)])
+    sensor = np.concatenate([np.empty(0, np.int8), *(np.full(len(record), s, np.int8) for s, record, _ in known)])
+    row = np.concatenate([np.empty(0, np.int64), *(np.arange(len(record)) for _, record, _ in known)])
     order = np.argsort(t_ns, kind="stable")
     n = len(t_ns)
     return Decisions(

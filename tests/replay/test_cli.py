@@ -14,9 +14,9 @@ from sensors.mcap.io import write_log
 from sensors.records import Log
 from sensors.simulate.drive import simulate
 from sensors.simulate.scenarios import load
+from tests.replay.fleet import LOG_FILES
 
 DURATION_S = 60.0
-RUN_FILES = ["config.toml", "decisions.parquet", "manifest.json", "metrics.json", "states.parquet"]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ class TestReplay:
         assert main(["replay", str(drive), "--out", str(out)]) == 0
         text = capsys.readouterr().out
         assert [word in text for word in ("GNSS-RTK", "EgoVM", "Fusion", "Scored: ")] == [True] * 4
-        assert sorted(p.name for p in out.iterdir()) == RUN_FILES
+        assert sorted(p.name for p in out.iterdir()) == LOG_FILES
         metrics = json.loads((out / "metrics.json").read_text())
         assert metrics["methods"]["fusion"]["ar"] > 0.95
         assert metrics["duration_s"] == pytest.approx(DURATION_S, abs=0.2)
@@ -68,7 +68,7 @@ class TestReplay:
     def test_the_same_log_and_config_give_the_same_bytes(self, drive: Path, run: Path, tmp_path: Path) -> None:
         config = run / "config.toml"  # complete: with the vehicle and the map frame of the log
         assert main(["replay", str(drive), "--out", str(tmp_path / "again"), "--config", str(config)]) == 0
-        for name in RUN_FILES:
+        for name in LOG_FILES:
             if name != "manifest.json":  # holds the command
                 assert (tmp_path / "again" / name).read_bytes() == (run / name).read_bytes(), name
 
@@ -85,10 +85,13 @@ class TestReplay:
         other = tmp_path / "other.mcap"
         shutil.copy(drive, other)
         assert main(["replay", str(drive), str(other), "--out", str(tmp_path / "runs"), "--json"]) == 0
-        assert set(json.loads(capsys.readouterr().out)) == {"drive", "other"}
-        assert (tmp_path / "runs/other/metrics.json").read_bytes() == (
-            tmp_path / "runs/drive/metrics.json"
-        ).read_bytes()
+        whole = json.loads(capsys.readouterr().out)
+        parts = [json.loads((tmp_path / "runs" / name / "metrics.json").read_text()) for name in ("drive", "other")]
+        assert whole["logs"] == {"total": 2, "done": 2, "failed": []}
+        assert parts[0] == parts[1]
+        assert whole["epochs"] == 2 * parts[0]["epochs"]
+        fusion, once = whole["methods"]["fusion"], parts[0]["methods"]["fusion"]
+        assert (fusion["ar"], fusion["lat"]["rmse"]) == (once["ar"], once["lat"]["rmse"])
         assert "different names, got 'other' twice" in refused(
             capsys, "replay", other, other, "--out", tmp_path / "twice"
         )
@@ -104,7 +107,7 @@ class TestReplay:
         assert (out / "notes.txt").read_text() == "mine"
         (out / "notes.txt").unlink()
         assert main(["replay", str(drive), "--out", str(out), "--overwrite"]) == 0
-        assert sorted(p.name for p in out.iterdir()) == RUN_FILES
+        assert sorted(p.name for p in out.iterdir()) == LOG_FILES
 
     def test_an_unknown_config_key(self, drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         config = tmp_path / "mine.toml"
@@ -230,6 +233,16 @@ class TestLogs:
             capsys, "simulate", "moon", tmp_path / "d.mcap"
         )
 
+    def test_simulate_goes_so_far(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        path = tmp_path / "log.mcap"
+        assert main(["simulate", "clean", str(path), "--length-km", "0.2", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["sensors"]["imu"]["count"] > 1000
+        assert main(["replay", str(path), "--out", str(tmp_path / "run"), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["distance_m"] == pytest.approx(200.0, abs=20.0)
+        assert "--length-km: expected more than 0" in refused(
+            capsys, "simulate", "clean", tmp_path / "b.mcap", "--length-km", "0"
+        )
+
     def test_convert_mistakes(self, drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "expected one of rtklib" in refused(capsys, "convert", "csv", tmp_path, tmp_path / "x.mcap")
         assert "no such file" in refused(capsys, "convert", "rtklib", tmp_path / "none", tmp_path / "x.mcap")
@@ -257,6 +270,18 @@ def test_the_demo_replaces_its_own_output_only(tmp_path: Path, capsys: pytest.Ca
     assert json.loads((out / "metrics.json").read_text())["methods"]["fusion"]["ar"] > 0.99
     assert main(["replay", str(tmp_path / "runs/demo.mcap"), "--out", str(tmp_path / "mine")]) == 0
     assert "exists already" in refused(capsys, "demo", "--out", tmp_path / "mine")
+
+
+@pytest.mark.slow
+def test_the_demo_of_a_campaign_stands_beside_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):  # the second replaces the first
+        assert main(["demo", "--campaign", "--out", str(tmp_path / "run")]) == 0
+    printed = capsys.readouterr().out
+    assert "EgoVM paper, Table 5" in printed
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert metrics["logs"] == {"total": 10, "done": 10, "failed": []}
+    assert metrics["distance_m"] == pytest.approx(200_000, rel=0.01)
+    assert "expected --campaign with it" in refused(capsys, "demo", "--workers", "2")
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])

@@ -8,9 +8,10 @@ import pytest
 
 from fusion.config import FusionConfig, MotionModel
 from replay.config import HideGnss, RunConfig
-from replay.harness import replay_log
+from replay.harness import replay_source
 from sensors.datasets import load
 from sensors.records import Log
+from tests.replay.cutting import Memory
 
 WIDE = FusionConfig(motion=MotionModel(lateral_sigma=0.2, sigma_per_speed=0.02))
 """As docs/datasets.md says."""
@@ -24,15 +25,16 @@ def kitti() -> Log:
     return load("gtsam-kitti", Path(found.submodule_search_locations[0]) / "Data")
 
 
-def test_no_position_of_the_drive_is_rejected(kitti: Log) -> None:
-    counts = replay_log(kitti, RunConfig(fusion=WIDE)).metrics["decisions"]["gnss_position"]
+def test_no_position_of_the_drive_is_rejected(kitti: Log, tmp_path: Path) -> None:
+    metrics = replay_source(Memory(kitti), tmp_path / "run", RunConfig(fusion=WIDE))
+    counts = metrics["decisions"]["gnss_position"]
     assert counts["accepted"] >= 465
     assert "chi_square" not in counts
 
 
-def test_drift_over_hidden_seconds_is_as_large_as_stated(kitti: Log) -> None:
+def test_drift_over_hidden_seconds_is_as_large_as_stated(kitti: Log, tmp_path: Path) -> None:
     config = msgspec.structs.replace(RunConfig(fusion=WIDE), hide_gnss=HideGnss(30.0, 5.0))
-    hidden = replay_log(kitti, config).metrics["hidden"]
+    hidden = replay_source(Memory(kitti), tmp_path / "run", config)["hidden"]
     assert hidden["stretches"] == 15
     assert hidden["end_horizontal_m"]["p50"] < 0.6
     assert hidden["end_horizontal_m"]["max"] < 1.5

@@ -6,22 +6,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusion.result import FusionResult, Sensor
+from fusion.result import FusionResult
 from replay.config import LIMITS, HideGnss, Limits, RunConfig
-from replay.harness import Replay, assemble, place
-from replay.hiding import hide_gnss
-from replay.metrics import evaluated_span
-from replay.scoring import score, sensor_metrics
-from sensors.errors import EgolocError
+from replay.metrics import metrics_of
 from sensors.records import GnssStatus, Log
 from sensors.vehicle import Vehicle
-from tests.replay.drives import FRAME, START_NS, decisions, drive, gnss, reference, stamps, states, to_map, track
+from tests.replay.assembling import Assembled, assemble
+from tests.replay.drives import START_NS, decisions, drive, gnss, reference, stamps, states, to_map, track
 
 S = 1_000_000_000
 ERROR = (0.05, -0.02, 0.002)
 
 
-def replayed(log: Log, result: FusionResult, **config: Any) -> Replay:
+def replayed(log: Log, result: FusionResult, **config: Any) -> Assembled:
     return assemble(log, RunConfig(**config), result)
 
 
@@ -44,7 +41,7 @@ def test_constant_errors_come_out_on_their_axes() -> None:
 
 
 def test_errors_are_estimate_minus_reference_along_and_left() -> None:
-    run = replayed(*drive(60.0, state_error=ERROR, pose_error=(0.1, 0.3, -0.01))).run
+    run = replayed(*drive(60.0, state_error=ERROR, pose_error=(0.1, 0.3, -0.01)))
     for name, expected in zip(("err_lon", "err_lat", "err_yaw"), ERROR, strict=True):
         np.testing.assert_allclose(run.states[name], expected, atol=1e-6)
     fixes = run.decisions["sensor"] == 3
@@ -69,8 +66,8 @@ def test_a_filter_that_never_aligns_is_never_available() -> None:
         "yaw": None,
     }
     assert done.metrics["alignment_s"] is None
-    assert len(done.run.states["t_ns"]) == 600
-    assert np.isnan(done.run.states["x"]).all()
+    assert len(done.states["t_ns"]) == 600
+    assert np.isnan(done.states["x"]).all()
 
 
 def test_an_outage_open_at_the_end_counts() -> None:
@@ -121,8 +118,8 @@ def test_an_imprecise_reference_is_excluded_by_the_limits_in_force() -> None:
     done = replayed(log, result)
     assert done.metrics["excluded"] == {"position_sigma": 600}
     assert done.metrics["methods"]["fusion"]["ar"] is None
-    assert score(done.run, LIMITS["highway"])["methods"]["fusion"]["ar"] == 1.0
-    sharp = score(done.run, Limits(3.0, 3.0, 0.001))
+    assert metrics_of(done.sums(LIMITS["highway"]))["methods"]["fusion"]["ar"] == 1.0
+    sharp = metrics_of(done.sums(Limits(3.0, 3.0, 0.001)))
     assert sharp["excluded"] == {}
     assert sharp["methods"]["fusion"]["ar"] == 0.0
 
@@ -176,9 +173,8 @@ def test_lever_arms_and_the_delay_of_gnss_are_taken_into_account(attitude: bool)
             assert metrics["methods"][name][axis]["p95"] < (1e-4 if attitude else 2e-2), (name, axis)
 
 
-def hidden_run(log: Log, result: FusionResult, hide: HideGnss) -> Replay:
-    hidden = hide_gnss(log, hide)
-    return assemble(hidden.log, RunConfig(hide_gnss=hide), replace(result, decisions=decisions(hidden.log)), hidden)
+def hidden_run(log: Log, result: FusionResult, hide: HideGnss) -> Assembled:
+    return assemble(log, RunConfig(hide_gnss=hide), result)
 
 
 def test_hidden_stretches_are_scored_at_the_antenna() -> None:
@@ -229,32 +225,8 @@ def test_decisions_keep_the_row_numbers_of_the_log() -> None:
     log, result = drive(200.0, with_reference=False)
     done = hidden_run(log, result, HideGnss(60.0, 15.0))
     assert log.gnss is not None
-    rows = done.run.decisions["row"][done.run.decisions["sensor"] == 0]
-    np.testing.assert_array_equal(log.gnss.t_ns[rows], done.run.decisions["t_ns"][done.run.decisions["sensor"] == 0])
-
-
-class TestPlace:
-    def test_a_log_with_map_coordinates_needs_a_frame(self) -> None:
-        log, _ = drive(1.0)
-        with pytest.raises(
-            EgolocError, match=r"x\.mcap: pose fixes and a reference in map coordinates: expected a map"
-        ):
-            place(replace(log, map_frame=None), RunConfig(), "x.mcap")
-
-    def test_a_log_of_gnss_gets_the_utm_frame_of_its_first_fix(self) -> None:
-        log, _ = drive(1.0, with_reference=False)
-        placed = place(replace(log, map_frame=None, pose_fixes=None), RunConfig(), "x.mcap")
-        assert placed.map_frame is not None
-        assert (placed.map_frame.kind, placed.map_frame.zone) == ("utm", 32)
-
-    def test_a_log_without_any_position(self) -> None:
-        with pytest.raises(EgolocError, match=r"x\.mcap: expected GNSS fixes or pose fixes, found neither"):
-            place(Log(), RunConfig(), "x.mcap")
-
-    def test_the_config_comes_first(self) -> None:
-        log, _ = drive(1.0)
-        vehicle = Vehicle(gnss_delay_s=0.3)
-        assert place(log, RunConfig(vehicle=vehicle, map_frame=FRAME), "x").vehicle is vehicle
+    rows = done.decisions["row"][done.decisions["sensor"] == 0]
+    np.testing.assert_array_equal(log.gnss.t_ns[rows], done.decisions["t_ns"][done.decisions["sensor"] == 0])
 
 
 def test_the_worked_example_of_the_documentation() -> None:
@@ -266,9 +238,11 @@ def test_the_worked_example_of_the_documentation() -> None:
     llh = fixes.llh.copy()
     llh[5] = left.llh[0]
     log = replace(log, gnss=replace(fixes, llh=llh), reference=reference(stamps(1.01, 100.0)))
-    run = replayed(log, replace(result, decisions=decisions(log))).run
-    span = evaluated_span(run.states["t_ns"], run.states["excluded"] == 0, run.states["ref_speed"], S / 10)
-    found = sensor_metrics(run.decisions, Sensor.GNSS_POSITION, span, LIMITS["paper"])
-    assert found["coverage"] == pytest.approx(0.65)
-    assert found["ar"] == pytest.approx(0.55)
-    assert found["lat"]["mae"] == pytest.approx(0.4 / 6, abs=1e-6)
+    found = replayed(log, replace(result, decisions=decisions(log))).sums(LIMITS["paper"]).segments
+    row = {
+        name: int(found.columns[name][found.of_method("gnss")].sum())
+        for name in ("evaluated_ns", "covered_ns", "good_ns")
+    }
+    assert row == {"evaluated_ns": S, "covered_ns": 65 * S // 100, "good_ns": 55 * S // 100}
+    lateral = found.chosen(found.of_method("gnss")).columns
+    assert lateral["lat_abs"].sum() / lateral["lat_count"].sum() == pytest.approx(0.4 / 6, abs=1e-6)

@@ -4,14 +4,19 @@ import io
 from dataclasses import replace
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 from rich.console import Console
 
+from replay import metrics as scores
 from replay.config import HideGnss, RunConfig
-from replay.harness import assemble
-from replay.hiding import hide_gnss
+from replay.paper import TABLE_5, paper_table
+from replay.sums import merge
 from replay.table import bench_table, print_run
-from tests.replay.drives import decisions, drive
+from sensors.records import Tags
+from tests.replay.assembling import Assembled, assemble
+from tests.replay.drives import START_NS, drive
 
 
 def printed(metrics: dict[str, Any], width: int) -> str:
@@ -87,9 +92,7 @@ def test_exclusions_and_left_out_rows_are_counted() -> None:
 
 def test_hidden_stretches_have_a_line_each() -> None:
     log, result = drive(200.0, with_reference=False, state_error=(0.3, 0.4, 0.0))
-    hidden = hide_gnss(log, HideGnss(60.0, 15.0))
-    config = RunConfig(hide_gnss=HideGnss(60.0, 15.0))
-    done = assemble(hidden.log, config, replace(result, decisions=decisions(hidden.log)), hidden)
+    done = assemble(log, RunConfig(hide_gnss=HideGnss(60.0, 15.0)), result)
     text = printed(done.metrics, 80)
     assert row(text, "      120.0") == ["120.0", "0.500", "0.141", "3.54", "15.0"]
     assert "Horizontal error at the end of 3 stretches of 15 s: median 0.500 m" in text.replace("\n", " ")
@@ -106,3 +109,93 @@ def test_a_benchmark_says_how_many_times_faster() -> None:
     Console(file=out, width=100).print(bench_table(result))
     assert row(out.getvalue(), "egoloc") == ["egoloc", "messages_per_s", "2e+06", "1", "3"]
     assert row(out.getvalue(), "peer")[-1] == "64.5"
+
+
+def tagged() -> Assembled:
+    """Twenty seconds of city, then forty of tunnel and night; autonomous throughout."""
+    log, result = drive(60.0, state_error=(0.05, -0.02, 0.002), pose_error=(0.12, 0.35, -0.005))
+    t_ns = START_NS + np.array([0, 20_000_000_000])
+    mode = Tags(t_ns[:1], t_ns[:1], np.array(["autonomous"]))
+    log = replace(log, scene=Tags(t_ns, t_ns, np.array(["city", "tunnel,night"])), mode=mode)
+    return assemble(log, RunConfig(), result)
+
+
+@pytest.mark.parametrize("width", [80, 132])
+def test_slices_have_exposure_and_a_line_a_method(width: int) -> None:
+    text = printed(tagged().metrics, width)
+    assert max(map(len, text.splitlines())) <= width
+    assert "…" not in text
+    lines = [line.split() for line in text.splitlines()]
+    assert [line[:6] for line in lines if line[:1] in (["city"], ["tunnel"], ["night"])] == [
+        ["city", "GNSS-RTK", "0.01", "0.2", "100", "100"],
+        *([tag, "GNSS-RTK", "0.01", "0.4", "100", "100"] for tag in ("night", "tunnel")),
+    ]
+    assert [line[:3] for line in lines if line[:1] == ["mode:"]] == [["mode:", "autonomous", "GNSS-RTK"]]
+    errors = ["0.120", "0.120", "0.350", "0.350", "0.286", "0.286"] if width > 100 else ["0.120", "0.350", "0.286"]
+    assert lines.count(["EgoVM", "0.00", "100", *errors]) == 4
+
+
+def campaign(*failed: dict[str, str]) -> dict[str, Any]:
+    sums = tagged().sums(RunConfig().limits)
+    lost = [{"kind": "lost", "text": "The filter lost track."}]
+    counts = msgspec.structs.replace(sums.counts, warnings=lost, warning_counts={"lost": 1})
+    logs = {"total": 60 + len(failed), "done": 60, "failed": list(failed)}
+    return scores.metrics_of(merge((f"drive-{i:02d}", replace(sums, counts=counts)) for i in range(60)), logs)
+
+
+def test_a_campaign_says_how_many_logs_and_how_far() -> None:
+    text = printed(campaign(), 132)
+    assert "Logs: 60 of 60." in text
+    assert "Scored: 35940 epochs, 3594.0 s, 35.9" in text
+    assert row(text, "Fusion")[:4] == ["Fusion", "100", "100", "0.050"]
+    assert text.count("The filter lost track.") == 3
+    assert "WARNING: lost: 60 of 60 logs" in text
+    assert "WARNING:   drive-00: The filter lost track." in text
+    assert "Aligned 0.0 s after the first IMU sample, the slowest log." in text
+
+
+def test_a_campaign_says_how_many_logs_failed() -> None:
+    text = printed(campaign({"log": "broken", "error": "broken.mcap: no messages"}), 132)
+    assert "Logs: 60 of 61; 1 failed and are not in these figures." in text
+
+
+def test_long_drives_are_told_in_hours() -> None:
+    text = printed(tagged().metrics | {"epochs": 19_800_000, "duration_s": 1_980_000.0, "distance_m": 16.5e6}, 132)
+    assert "Scored: 19,800,000 epochs, 550.00 h, 16,500.0 km against odometry" in text
+
+
+PAPER_ROWS = """
+GNSS-RTK&93.67%&0.132&1.082&91.41/93.33/94.12&0.122&0.950&91.26/93.63/94.54&-&-&-/-/-
+EgoVM&99.82%&0.037&0.104&96.99/99.66/99.77&0.026&0.035&98.54/99.93/99.99&0.131&0.506&42.49/96.29/99.75
+Fusion&100.00%&0.030&0.040&97.80/99.84/99.96&0.026&0.036&97.90/99.89/100.00&0.122&0.192&44.41/97.31/99.74
+"""
+
+
+class TestPaper:
+    def printed(self, metrics: dict[str, Any]) -> str:
+        out = io.StringIO()
+        Console(file=out, width=132, highlight=False).print(paper_table(metrics))
+        return out.getvalue()
+
+    def test_the_papers_rows(self) -> None:
+        """Against the lines of its Table 5 (LaTeX source of the paper)."""
+        text = self.printed(tagged().metrics)
+        found = [
+            line.split("paper")[1].split() for line in text.splitlines() if " paper " in line and "Table" not in line
+        ]
+        for cells, line in zip(found, PAPER_ROWS.strip().splitlines(), strict=True):
+            plain = line.replace("&", " ").replace("/", " ").replace("%", "").replace("100.00", "100")
+            assert cells == plain.split()[1:]
+
+    def test_ours_stand_below(self) -> None:
+        text = self.printed(tagged().metrics)
+        ours = [line.split() for line in text.splitlines() if line.split()[:1] == ["here"]]
+        assert len(ours) == len(TABLE_5)
+        assert ours[1][:4] == ["here", "0.00", "0.120", "0.120"]
+        assert "EgoVM paper, Table 5 (16,500 km on roads), and this simulation (1 km)" in text
+
+    def test_a_method_without_data_has_dashes(self) -> None:
+        metrics = tagged().metrics
+        del metrics["methods"]["gnss"]
+        ours = [line.split() for line in self.printed(metrics).splitlines() if line.split()[:1] == ["here"]]
+        assert ours[0] == ["here", *["-"] * 16]

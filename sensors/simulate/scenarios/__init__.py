@@ -20,8 +20,8 @@ class Scenario(DriveConfig, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """One line: what it is for."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
     """Seed of everything random in it."""
-    duration_s: Positive = 600.0
-    """Length of the drive, s."""
+    duration_s: Positive | None = None
+    """Longest drive, s; with neither this nor length_km: ten minutes."""
 
 
 def names() -> list[str]:
@@ -40,7 +40,15 @@ def load(name_or_path: str | Path) -> Scenario:
         content = path.read_bytes()
     except OSError as error:
         raise EgolocError(f"{path}: cannot read the scenario: {error.strerror}") from error
-    return _decode(str(path), content)
+    return _beside(path, _decode(str(path), content))
+
+
+def _beside(path: Path, scenario: Scenario) -> Scenario:
+    """A relative path of a trajectory is meant from the scenario's folder."""
+    if scenario.trajectory is None:
+        return scenario
+    file = str(path.parent / scenario.trajectory.file)
+    return msgspec.structs.replace(scenario, trajectory=msgspec.structs.replace(scenario.trajectory, file=file))
 
 
 def _decode(source: str, content: bytes) -> Scenario:

@@ -14,9 +14,9 @@ from sensors.records import Log
 from sensors.rotation import multiply
 from sensors.simulate import scenarios
 from sensors.simulate.drive import Drive, DriveConfig, simulate, simulate_drive
-from sensors.simulate.gnss import GnssSimulation
+from sensors.simulate.gnss_config import GnssSimulation
 from sensors.simulate.imu import ImuSimulation
-from sensors.simulate.pose_fix import PoseFixSimulation
+from sensors.simulate.pose_config import PoseFixSimulation
 from sensors.simulate.reference import ReferenceSimulation
 from sensors.simulate.wheel import WheelSimulation
 from sensors.vehicle import Vehicle
@@ -192,14 +192,17 @@ def test_a_scenario_that_is_not_there(tmp_path: Path) -> None:
 
 def test_the_snippets_of_the_docs_run(tmp_path: Path) -> None:
     page = (Path(__file__).resolve().parents[3] / "docs/simulation.md").read_text()
-    snippets = dict(re.findall(r"```(python|toml)\n(.*?)```", page, re.DOTALL))
+    snippets = re.findall(r"```(python|toml)\n(.*?)```", page, re.DOTALL)
     names: dict[str, Any] = {}
-    exec(snippets["python"], names)
+    exec(next(text for kind, text in snippets if kind == "python"), names)
     assert len(names["motion"].llh) == len(names["drive"].log.gnss)
-    path = tmp_path / "page.toml"
-    path.write_text(snippets["toml"])
-    scenario = scenarios.load(path)
-    log = simulate(60.0, scenario.seed, scenario)
+    path, shown = tmp_path / "page.toml", {}
+    for text in (text for kind, text in snippets if kind == "toml"):
+        path.write_text(text)
+        scenario = scenarios.load(path)
+        shown[scenario.name] = simulate(60.0, scenario.seed, scenario)
+        assert shown[scenario.name].gnss is not None
+    log = shown["float-only"]
     assert log.gnss is not None
     assert np.mean(log.gnss.status == 3) > 0.9
     assert log.vehicle.imu.samples == "increment"
@@ -219,6 +222,6 @@ def _toml(tree: dict[str, object], prefix: str = "") -> list[str]:
     for key, value in tree.items():
         if isinstance(value, dict):
             lines += _toml(value, f"{prefix}{key}.")
-        else:
+        elif value is not None:
             lines.append(f"{prefix}{key} = {msgspec.json.encode(value).decode()}")
     return lines

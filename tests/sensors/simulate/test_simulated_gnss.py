@@ -9,11 +9,14 @@ from scipy.stats import chi2, kstest
 from sensors.geodesy import ecef_from_llh, rotation_ecef_enu
 from sensors.records import GnssFix, GnssStatus
 from sensors.rotation import wrap, yaw_from_q
-from sensors.simulate.drive import Drive
-from sensors.simulate.gnss import GnssSimulation, rtk_schedule, simulate_gnss
+from sensors.simulate.drive import Drive, featureless
+from sensors.simulate.gnss import GnssSensor
+from sensors.simulate.gnss_config import GnssSimulation
 from sensors.simulate.noise import stamps
+from sensors.simulate.rtk import RtkHistory
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import Vehicle
+from tests.sensors.simulate.courses import epochs, straight
 
 WHITE = GnssSimulation(correlated_fraction=0.0)
 VEHICLE = Vehicle(gnss_lever_arm=(0.5, 0.0, 1.2))
@@ -28,7 +31,7 @@ def errors(fix: GnssFix, truth: Truth, vehicle: Vehicle) -> NDArray[np.float64]:
 
 def run(truth: Truth, config: GnssSimulation, seed: int = 0):  # type: ignore[no-untyped-def]
     motion = truth.at(stamps(truth.start_ns, 600.0, config.rate_hz))
-    return simulate_gnss(motion, VEHICLE, config, np.random.default_rng(seed))
+    return GnssSensor(featureless(truth), VEHICLE, config, np.random.default_rng(seed)).sense(motion)
 
 
 def test_white_errors_have_the_stated_covariance(truth: Truth) -> None:
@@ -53,8 +56,9 @@ def test_correlated_errors_have_the_stated_covariance_and_memory(truth: Truth) -
 
 def test_schedule_is_fixed_most_of_the_time_and_floats_after_a_loss() -> None:
     config = GnssSimulation()
-    t_ns = stamps(0, 100 * 3600.0, 10.0)
-    status = rtk_schedule(t_ns, config, np.random.default_rng(0))
+    t_ns = epochs(100 * 3600.0, 10.0)
+    status, offset = RtkHistory(straight(100 * 3600.0), config, np.random.default_rng(0)).at(t_ns)
+    assert not offset.any()
     assert np.mean(status == GnssStatus.FIXED) == pytest.approx(0.94, abs=0.02)
     begins = np.flatnonzero(np.diff(status)) + 1
     before, after = status[begins - 1], status[begins]

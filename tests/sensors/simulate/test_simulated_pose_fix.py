@@ -9,9 +9,10 @@ from scipy.stats import chi2, kstest
 from sensors.geodesy import MapFrame, map_from_llh
 from sensors.records import PoseFix
 from sensors.rotation import wrap
-from sensors.simulate.drive import Drive, DriveConfig, Start, simulate_drive
+from sensors.simulate.drive import Drive, DriveConfig, Start, featureless, simulate_drive
 from sensors.simulate.noise import stamps
-from sensors.simulate.pose_fix import PoseFixSimulation, simulate_pose_fixes
+from sensors.simulate.pose_config import PoseFixSimulation
+from sensors.simulate.pose_fix import PoseFixSensor
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import Vehicle
 
@@ -20,8 +21,8 @@ WHITE = PoseFixSimulation(correlated_fraction=0.0)
 
 def fixes(drive: Drive, config: PoseFixSimulation, seed: int = 0, vehicle: Vehicle | None = None) -> PoseFix:
     motion = drive.truth.at(stamps(drive.truth.start_ns, 600.0, config.rate_hz, config.phase_s))
-    frame = frame_of(drive)
-    return simulate_pose_fixes(motion, frame, vehicle or Vehicle(), config, np.random.default_rng(seed))
+    course, rng = featureless(drive.truth), np.random.default_rng(seed)
+    return PoseFixSensor(course, frame_of(drive), vehicle or Vehicle(), config, rng).sense(motion)
 
 
 def frame_of(drive: Drive) -> MapFrame:
