@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from fusion.config import FusionConfig, check
 from fusion.covariance import Noise
@@ -43,7 +43,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
     gates, motion, pose = config.gates, config.motion, config.pose
     check(config)
     if gates.use:
-        first, second, third = (float(chi2.ppf(gates.probability, dof)) for dof in (1, 2, 3))
+        first, second, third = (_chi_square(gates.probability, dof) for dof in (1, 2, 3))
     else:
         first = second = third = np.inf
     noise = noise_of(vehicle.imu, config.imu.noise_scale, motion.wheel_scale_walk if motion.wheel else 0.0)
@@ -78,6 +78,11 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         zero_velocity_var=motion.zero_velocity_sigma**2,
         zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2) + noise.gyro_psd * motion.rate_hz,
     )
+
+
+def _chi_square(probability: float, dof: int) -> float:
+    """The quantile of a chi-square distribution (scipy.stats has it as well, and takes most of a second to import)."""
+    return 2.0 * float(gammaincinv(dof / 2.0, probability))
 
 
 def _vector(given: tuple[float, float, float]) -> tuple[float, float, float]:

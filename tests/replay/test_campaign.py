@@ -270,9 +270,7 @@ class TestSources:
         assert "expected an MCAP log, got a folder" in refused("replay", tmp_path, *out)
         assert "expected a .toml file or one of the scenarios" in refused("replay", "scenario:moon,drives=2", *out)
         assert "got 'speed=3'" in refused("replay", "scenario:clean,speed=3", *out)
-        assert "drives: expected a number from 1 to" in refused(
-            "replay", "scenario:clean,drives=0", *out
-        )
+        assert "drives: expected a number from 1 to" in refused("replay", "scenario:clean,drives=0", *out)
         assert "length_km: expected kilometres, got 'far'" in refused("replay", "scenario:clean,length_km=far", *out)
         assert "--workers: expected 1 or more" in refused("replay", "scenario:clean", *out, "--workers", "0")
         assert "--workers and --ray" in refused("replay", "scenario:clean", *out, "--workers", "2", "--ray", "local")

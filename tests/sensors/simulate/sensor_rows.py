@@ -1,6 +1,6 @@
 """GNSS-RTK alone and EgoVM alone on a scenario, against the truth: the rows that road-test is set by.
 
-    python -m tests.sensors.simulate.sensor_rows [--scenario road-test] [--drives 100] [--seed 100000]
+    python -m tests.sensors.simulate.sensor_rows [--scenario road-test] [--drives 100] [--seed 100000] [--network 0]
 
 No filter runs here. Definitions are those of docs/metrics.md: a fix stands for the time back to the one before it, 1.5
 periods at most; AR counts all time from the reference's start on, MAE and RMSE the fixes.
@@ -12,6 +12,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -119,8 +120,10 @@ def main() -> None:
     parser.add_argument("--scenario", default="road-test")
     parser.add_argument("--drives", type=int, default=100)
     parser.add_argument("--seed", type=int, default=100_000)
+    parser.add_argument("--network", type=int, default=0, help="seed of the roads; the scenario's are for reports")
     given = parser.parse_args()
-    found, km = rows(load(given.scenario), range(given.seed, given.seed + given.drives))
+    config = msgspec.structs.replace(load(given.scenario), network_seed=given.network)
+    found, km = rows(config, range(given.seed, given.seed + given.drives))
     show(found)
     print("  ".join(f"{name} {length:.1f} km" for name, length in sorted(km.items())))
 
