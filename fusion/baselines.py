@@ -27,14 +27,20 @@ def over_best_baseline(fixes: deque[Fix]) -> Fix | None:
 
     A short baseline shows the fixes' noise, a long one the acceleration in between (1 m/s^2): the smaller sum wins.
     """
-    best: Fix | None = None
+    best, least = None, math.inf
     for older in fixes:
         dt = (fixes[-1].t_ns - older.t_ns) * 1e-9
         if 0.0 < dt <= _LONGEST_BASELINE_S:
-            cov = (fixes[-1].cov + older.cov) / dt**2 + np.eye(3) * (0.5 * dt) ** 2
-            if best is None or cov[0, 0] < best.cov[0, 0]:
-                best = Fix(fixes[-1].t_ns, enu_between(older.value, fixes[-1].value) / dt, cov)
-    return best
+            variance = (fixes[-1].cov[0, 0] + older.cov[0, 0]) / dt**2 + (0.5 * dt) ** 2
+            if variance < least:
+                best, least = older, variance
+    return None if best is None else _velocity_between(best, fixes[-1])
+
+
+def _velocity_between(older: Fix, last: Fix) -> Fix:
+    dt = (last.t_ns - older.t_ns) * 1e-9
+    cov = (last.cov + older.cov) / dt**2 + np.eye(3) * (0.5 * dt) ** 2
+    return Fix(last.t_ns, enu_between(older.value, last.value) / dt, cov)
 
 
 def enu_between(a: Floats, b: Floats) -> Floats:

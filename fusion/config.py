@@ -71,11 +71,11 @@ class PoseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_floor_yaw_deg: NonNegative = 0.05
     """Smallest sigma of yaw, deg."""
     max_sigma_longitudinal_m: Positive = 0.47
-    """Covariance gate: a direction with more than this is not observed by the histogram and is dropped, m."""
+    """Covariance gate: a direction with more than this (inflated) is not observed by the histogram, and dropped, m."""
     max_sigma_lateral_m: Positive = 0.47
     """The same, lateral, m."""
-    max_sigma_yaw_deg: Positive = 0.47
-    """The same, yaw, deg."""
+    max_sigma_yaw_deg: Positive = 0.66
+    """The same, yaw (half a flat window's variance): at rest there is no other yaw to start with, deg."""
 
 
 class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._kernels import process
-from fusion.alignment import Aligner, Initial
+from fusion.alignment import SERVING, Aligner, Initial
 from fusion.config import FusionConfig
 from fusion.events import OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
 from fusion.mechanization import refresh
@@ -107,10 +107,10 @@ class Navigator:
         """Offer pending measurements up to known_ns in stamp order until one completes a first state."""
         waiting, columns = self.pending, (imu.t_ns, imu.gyro, imu.accel)
         initial: Initial | None = None
-        for i in range(int(np.searchsorted(waiting.t_ns, known_ns, side="right"))):
+        known = (waiting.t_ns >= self._first_imu_ns) & (waiting.t_ns <= known_ns)
+        for i in np.flatnonzero(known & (waiting.verdict == APPLY) & np.isin(waiting.kind, SERVING)):
             t_ns, kind, row = int(waiting.t_ns[i]), int(waiting.kind[i]), int(waiting.row[i])
-            if waiting.verdict[i] == APPLY and t_ns >= self._first_imu_ns:
-                initial = self._aligner.offer(t_ns, kind, row, waiting.measurements, columns)
+            initial = self._aligner.offer(t_ns, kind, row, waiting.measurements, columns)
             if initial is not None:
                 break
         early, self.pending = split(waiting, known_ns if initial is None else initial.t_ns)

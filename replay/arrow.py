@@ -45,7 +45,8 @@ def read_columns(path: Path, texts: Sequence[str], numbers: Mapping[str, type]) 
         raise EgolocError(f"{path}: missing: {EXPECTED}")
     try:
         with pq.ParquetFile(path, page_checksum_verification=True, read_dictionary=list(texts)) as file:
-            missing = [name for name in (*texts, *numbers) if name not in file.schema_arrow.names]
+            held = file.schema_arrow.names
+            missing = [name for name in (*texts, *numbers) if name not in held]
             if missing:
                 raise EgolocError(f"{path}: expected the columns of a run, without: {', '.join(missing)}")
             table = file.read(columns=[*texts, *numbers], use_threads=False)

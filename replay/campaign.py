@@ -13,7 +13,6 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -139,10 +138,7 @@ def _merged(out: Path, names: Sequence[str], failed: dict[str, Outcome]) -> Camp
     if not done:
         return Campaign(None, logs)
     whole = merge((name, Sums.from_parquet(out / name)) for name in done)
-    with TemporaryDirectory(prefix=".merged.", suffix=".tmp", dir=out) as folder:
-        whole.to_parquet(Path(folder))
-        for path in Path(folder).iterdir():
-            path.replace(out / path.name)
+    whole.to_parquet(out)
     metrics = metrics_of(whole, logs=logs)
     write_json(out / "metrics.json", metrics)
     return Campaign(metrics, logs)

@@ -44,7 +44,8 @@ class Pairs:
     """The common segments of two runs, by scene text and mode.
 
     pair (R,): which of `count` pairs a row belongs to; group (R,): its scene text and mode, an index into groups, in
-    increasing order; sums (2, R, methods, SUMMED) of each run; alone: segments that only A, only B evaluated.
+    increasing order; sums (2, R, methods, SUMMED) of each run, zero for a method that only one evaluated in a segment;
+    alone: segments that only A, only B evaluated.
     """
 
     count: int
@@ -128,7 +129,7 @@ def paired(one: Segments, two: Segments, *, by_log: bool = True) -> Pairs:
     places = places[places >= 0]
     sums = np.stack([_sums(table, own, places) for table, own in zip((one, two), cells, strict=True)])
     group, pair = np.divmod(places, max(len(common), 1))
-    return Pairs(len(common), pair, group, texts, sums, (alone[0], alone[1]))
+    return Pairs(len(common), pair, group, texts, _where_both(sums, pair, len(common)), (alone[0], alone[1]))
 
 
 def _keys(table: Segments, logs: dict[str, int]) -> Integers:
@@ -162,6 +163,15 @@ def _sums(table: Segments, cells: Integers, places: Integers) -> Floats:
     for i, name in enumerate(SUMMED):
         found[:, i] = np.bincount(at, table.columns[name][rows], len(found))
     return found.reshape(len(places), len(METHODS), len(SUMMED))
+
+
+def _where_both(sums: Floats, pair: Integers, count: int) -> Floats:
+    """The sums of Pairs without those of a method in a segment where only one of the runs evaluated it."""
+    evaluated = np.zeros((2, count, len(METHODS)))
+    for run, total in enumerate(evaluated):
+        np.add.at(total, pair, sums[run, :, :, SUMMED.index("evaluated_ns")])
+    in_both = np.all(evaluated > 0, axis=0)[pair]
+    return np.where(in_both[..., None], sums, 0.0)
 
 
 def figures(sums: Floats) -> Floats:

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from replay.compare import LEAST_PAIRS
-from replay.table import METHOD_NAMES, UNITS, bare_table, output_console
+from replay.table import METHOD_NAMES, UNITS, bare_table, output_console, percent
 
 Row = Mapping[str, Any]
 
@@ -62,8 +62,9 @@ def _figure(name: str) -> str:
 
 def _numbers(row: Row) -> list[str]:
     """A, B, the difference and its interval; shares in per cent."""
-    factor, digits = (100, 3) if row["figure"] in SHARES else (1, 4)
-    plain = [f"{factor * row[key]:.{digits}f}" for key in ("a", "b")]
+    share = row["figure"] in SHARES
+    factor, digits = (100, 3) if share else (1, 4)
+    plain = [percent(row[key], 3) if share else f"{row[key]:.4f}" for key in ("a", "b")]
     ends = ["-" if row[key] is None else f"{factor * row[key]:+.{digits}f}" for key in ("difference", "low", "high")]
     return plain + ends
 

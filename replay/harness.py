@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -119,9 +118,7 @@ def score_run(folder: Path, limits: Limits) -> Metrics:
         scorer.add(batch.states, batch.decisions)
     sums = scorer.finish(facts, batch.scenes, batch.modes)
     metrics = metrics_of(sums)
-    with storage(folder), TemporaryDirectory(prefix=".", suffix=".tmp", dir=folder) as beside:
-        sums.to_parquet(Path(beside))
-        for path in Path(beside).iterdir():
-            path.replace(folder / path.name)
+    with storage(folder):
+        sums.to_parquet(folder)
         write_json(folder / "metrics.json", metrics)
     return metrics

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.result import Sensor
 from replay.config import Limits
 from replay.segments import AXES, BELOW, METHODS, THRESHOLDS, Segments, tags
 from replay.sketch import Sketch, percentiles
@@ -17,10 +18,12 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Metrics = dict[str, Any]
 
+SENSORS = {"gnss": Sensor.GNSS_POSITION, "egovm": Sensor.POSE_FIX}
+"""Methods that are a sensor's fixes."""
 SIGMA_SHARE = 1 / 3
 """The reference's sigma must not exceed this share of the limit."""
 MIN_EVALUATED_NS = 10 * NS_PER_S
-"""With less evaluated time than this nothing is said."""
+"""With less evaluated time than this nothing is said of a method."""
 MIN_DISTANCE_M = 1.0
 """With less evaluated distance than this there is no distance-weighted ratio, m."""
 SHARES = {"p50": 50, "p95": 95, "p99": 99}
@@ -65,14 +68,10 @@ def _exposure(segments: Segments) -> Metrics:
     """How much was evaluated: fusion can be compared wherever there is a reference."""
     of = segments.of_method("fusion")
     return {
-        "duration_s": _evaluated_ns(segments) / NS_PER_S,
+        "duration_s": int(segments.columns["evaluated_ns"][of].sum()) / NS_PER_S,
         "distance_m": math.fsum(segments.columns["evaluated_m"][of]),
         "epochs": int(segments.columns["epochs"][of].sum()),
     }
-
-
-def _evaluated_ns(segments: Segments) -> int:
-    return int(segments.columns["evaluated_ns"][segments.of_method("fusion")].sum())
 
 
 def _slices(sums: Sums, kind: str) -> Metrics:
@@ -96,28 +95,25 @@ def _methods(counts: Counts, segments: Segments, sketch: Sketch) -> Metrics:
     least: float = MIN_EVALUATED_NS
     if counts.hidden_length_s is not None:
         least = min(least, 0.9 * counts.hidden_length_s * NS_PER_S)
-    enough = _evaluated_ns(segments) >= max(least, 1)
     return {
-        method: method_metrics(segments.chosen(segments.of_method(method)), sketch, method)
-        if enough
-        else dict(NOT_EVALUATED)
+        method: method_metrics(segments.chosen(segments.of_method(method)), sketch, method, least)
         for method in methods_of(counts)
     }
 
 
 def methods_of(counts: Counts) -> list[str]:
     """The methods with data, in the order of METHODS."""
-    sensor = {"gnss": "gnss_position", "egovm": "pose_fix"}
-    hidden = counts.hidden_length_s is not None
-    present = [name for name in sensor if sensor[name] in counts.decisions and not (hidden and name == "gnss")]
-    return [name for name in METHODS if name in (*present, "fusion")]
+    present = {name for name, sensor in SENSORS.items() if sensor.name.lower() in counts.decisions}
+    if counts.hidden_length_s is not None:
+        present.discard("gnss")  # it is the reference
+    return [name for name in METHODS if name in present or name == "fusion"]
 
 
-def method_metrics(rows: Segments, sketch: Sketch, method: str) -> Metrics:
-    """One method's entry of metrics.json, from its rows."""
+def method_metrics(rows: Segments, sketch: Sketch, method: str, least_ns: float = 1) -> Metrics:
+    """One method's entry of metrics.json, from its rows; nothing is said of less than least_ns of evaluated time."""
     columns = rows.columns
     total_ns, total_m = int(columns["evaluated_ns"].sum()), math.fsum(columns["evaluated_m"])
-    if total_ns <= 0:
+    if total_ns < max(least_ns, 1):
         return dict(NOT_EVALUATED)
     return {
         "ar": int(columns["good_ns"].sum()) / total_ns,

@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from replay.segments import AXES
-from replay.table import METHOD_NAMES, axis_cells, axis_headers, bare_table, percent
+from replay.table import METHOD_NAMES, ar_digits, axis_cells, axis_headers, bare_table, percent
 
 PAPER_KM = 16_500
 TABLE_5: Mapping[str, Any] = {
@@ -49,5 +49,5 @@ def paper_table(metrics: Mapping[str, Any]) -> Table:
         ours = metrics["methods"].get(method, {"ar": None, **dict.fromkeys(AXES)})
         for name, source, figures in ((METHOD_NAMES[method], "paper", row), ("", "here", ours)):
             cells = [cell for axis in AXES for cell in axis_cells(figures[axis], 2)]
-            table.add_row(name, source, percent(figures["ar"], 2), *cells)
+            table.add_row(name, source, percent(figures["ar"], 2 if source == "paper" else ar_digits(metrics)), *cells)
     return table

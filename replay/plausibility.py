@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.result import Decisions, FusionResult, Reason, Sensor, States
+from replay.decisions import APPLIED, FIXES
 from sensors.clock import NS_PER_S
 from sensors.records import Imu, Log
 
@@ -33,10 +34,8 @@ LOST_COUNT = 10
 INERT_SHARE = 0.5
 """A sensor with more of its measurements rejected than this says something about itself or the filter."""
 
-_POSITIONS = (Sensor.GNSS_POSITION, Sensor.POSE_FIX)
-_APPLIED = (Reason.ACCEPTED, Reason.PARTLY_ACCEPTED, Reason.USED_FOR_ALIGNMENT)
-_IS_POSITION = np.isin(np.arange(len(Sensor)), _POSITIONS)
-_IS_JUDGED = np.isin(np.arange(len(Reason)), (*_APPLIED, Reason.CHI_SQUARE))
+_IS_POSITION = np.isin(np.arange(len(Sensor)), FIXES)
+_IS_JUDGED = np.isin(np.arange(len(Reason)), (*APPLIED, Reason.CHI_SQUARE))
 
 
 class Watch:
@@ -127,8 +126,8 @@ class Watch:
     def _rejected(self) -> str:
         """Sensors of which the chi-square gate rejected most."""
         named = []
-        for sensor in (*_POSITIONS, Sensor.GNSS_VELOCITY, Sensor.GNSS_YAW, Sensor.WHEEL):
-            rejected, applied = int(self._counts[sensor, Reason.CHI_SQUARE]), int(self._counts[sensor, _APPLIED].sum())
+        for sensor in (*FIXES, Sensor.GNSS_VELOCITY, Sensor.GNSS_YAW, Sensor.WHEEL):
+            rejected, applied = int(self._counts[sensor, Reason.CHI_SQUARE]), int(self._counts[sensor, APPLIED].sum())
             if rejected >= LOST_COUNT and rejected > INERT_SHARE * (rejected + applied):
                 named.append(f"{sensor.name.lower().replace('_', ' ')} ({rejected} of {rejected + applied})")
         return f"The filter rejected most of a sensor: {', '.join(named)}." if named else ""

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from fusion.result import Reason, Sensor
 from replay.cells import Cells
 from replay.config import Limits
-from replay.metrics import well_known
+from replay.metrics import SENSORS, methods_of, well_known
 from replay.outputs import Outputs, Waiting, cover_ns, longest_cover_ns
 from replay.references import Excluded
 from replay.run_files import Facts
 from replay.segments import AXES, METHODS
-from replay.stretches import Stretches
+from replay.stretches import StretchEnds
 from replay.sums import Counts, Sums
 from sensors.clock import NS_PER_S
 from sensors.records import GnssStatus
@@ -27,7 +27,6 @@ from sensors.records import GnssStatus
 Floats = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]
 
-SENSORS = {"gnss": Sensor.GNSS_POSITION, "egovm": Sensor.POSE_FIX}
 STATES = (
     *("t_ns", "x", "y", "ref_x", "ref_y", "ref_yaw", "ref_speed", "ref_sigma_m", "ref_sigma_yaw", "excluded"),
     *("err_lon", "err_lat", "err_yaw", "sigma_lon", "sigma_lat", "stretch", "scene", "mode"),
@@ -53,7 +52,7 @@ class Scorer:
         self._limits, self._log, self._period_ns = limits, log, period_ns
         self._cells = Cells(limits, start_ns)
         self._waiting = {method: Waiting() for method in SENSORS}
-        self._stretches = Stretches()
+        self._stretches = StretchEnds()
         self._grid = Outputs(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
         self._speed = np.empty(0)
         self._before_ns: int | None = None
@@ -78,12 +77,11 @@ class Scorer:
     def finish(self, facts: Facts, scenes: Sequence[str] = ("",), modes: Sequence[str] = ("",)) -> Sums:
         """The sums of the whole drive. scenes, modes: the texts of the codes."""
         self._sum_fixes(None)
-        hidden = facts["stretches"] is not None
-        present = [name for name, sensor in SENSORS.items() if self._decisions[sensor].any()]
-        methods = [*(name for name in present if not (hidden and name == "gnss")), "fusion"]
+        counts = self._counts(facts)
+        methods = methods_of(counts)
         texts = {"log": (self._log,), "scene": tuple(scenes), "mode": tuple(modes), "method": METHODS}
         sketch = self._cells.histograms.sketch(lambda key: _named(key, scenes, modes), methods)
-        return Sums(self._counts(facts), self._cells.table(methods, texts), sketch)
+        return Sums(counts, self._cells.table(methods, texts), sketch)
 
     def _add_states(self, states: Columns) -> None:
         """Sum the grid and fusion's states on it, and keep the grid for the fixes that are still to come."""

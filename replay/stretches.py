@@ -12,11 +12,11 @@ Columns = dict[str, NDArray[Any]]
 Entry = dict[str, Any]
 
 END_TOLERANCE_NS = NS_PER_S
-"""The last scored epoch of a hidden stretch must lie this near its end for its error to count as that of the end."""
+"""The last known epoch of a hidden stretch must lie this near its end for its error to count as that of the end."""
 _KNOWN = ("ref_x", "x", "y", "sigma_lon", "sigma_lat")
 
 
-class Stretches:
+class StretchEnds:
     """The last epoch of each stretch that has a reference, a state and a sigma, batch by batch."""
 
     def __init__(self) -> None:

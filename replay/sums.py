@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Self
 
 import msgspec
@@ -70,13 +71,16 @@ class Sums:
     sketch: Sketch
 
     def to_parquet(self, folder: Path) -> None:
-        """Write segments.parquet and percentiles.parquet into a folder."""
+        """Write segments.parquet and percentiles.parquet into a folder; others there stay until both are whole."""
         import pyarrow.parquet as pq
 
         table = self.segments.to_arrow().replace_schema_metadata({_KEY: msgspec.json.encode(self.counts)})
         options = {"compression": "zstd", "use_dictionary": list(TEXTS), "write_statistics": False}
-        pq.write_table(table, folder / SEGMENTS, write_page_checksum=True, **options)
-        self.sketch.write(folder / PERCENTILES)
+        with TemporaryDirectory(prefix=".", suffix=".tmp", dir=folder) as beside:
+            pq.write_table(table, Path(beside) / SEGMENTS, write_page_checksum=True, **options)
+            self.sketch.write(Path(beside) / PERCENTILES)
+            for name in (SEGMENTS, PERCENTILES):
+                (Path(beside) / name).replace(folder / name)
 
     @classmethod
     def from_parquet(cls, folder: Path) -> Self:

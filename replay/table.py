@@ -58,7 +58,7 @@ def render(metrics: Metrics, width: int) -> RenderableType:
     if "hidden" in metrics and len(metrics["hidden"]["per_stretch"]) <= MOST_STRETCHES:
         parts += [_stretch_table(metrics["hidden"]), ""]
     if metrics["slices"]:
-        parts += [_slice_table(metrics["slices"], wide=width >= WIDE), ""]
+        parts += [_slice_table(metrics, wide=width >= WIDE), ""]
     warnings = [Text(f"WARNING: {text}", style="bold red") for text in _warnings(metrics)]
     return Group(*parts, *warnings, *(Text(note) for note in notes(metrics)))
 
@@ -79,7 +79,7 @@ def notes(metrics: Metrics) -> Iterator[str]:
     limits = metrics["limits"]
     yield (
         f"AR: share of time with errors below {limits['lon_m']:g} m longitudinal, {limits['lat_m']:g} m lateral, "
-        f"{limits['yaw_deg']:g} deg yaw; cov: share of time with output; all in %."
+        f"{limits['yaw_deg']:g} deg yaw; cov: share with output; all in %, 100: without exception."
     )
     if "logs" in metrics:
         yield _logs(metrics["logs"])
@@ -110,7 +110,7 @@ def _method_table(metrics: Metrics, axes: tuple[str, ...], gap: int) -> Table:
         for header in axis_headers(axis):
             table.add_column(header, justify="right", no_wrap=True)
     for name, method in metrics["methods"].items():
-        shares = [percent(method["ar"], 2), percent(method["coverage"])] if first else []
+        shares = [percent(method["ar"], ar_digits(metrics)), percent(method["coverage"])] if first else []
         cells = [cell for axis in axes for cell in axis_cells(method[axis])]
         table.add_row(METHOD_NAMES.get(name, name), *shares, *cells)
     return table
@@ -136,7 +136,7 @@ def axis_cells(axis: Metrics | None, digits: int = 1) -> list[str]:
     ]
 
 
-def _slice_table(slices: Metrics, *, wide: bool) -> Table:
+def _slice_table(metrics: Metrics, *, wide: bool) -> Table:
     """Exposure and figures by scene tag and by drive mode; without RMSE where it is narrow."""
     table = bare_table(2 if wide else 1)
     for header in ("\nslice", "\nmethod"):
@@ -145,13 +145,14 @@ def _slice_table(slices: Metrics, *, wide: bool) -> Table:
     headers = [f"{UNITS[axis] if figure == 'mae' else ''}\n{figure.upper()}" for axis, figure in errors]
     for header in ("\nh", "\nkm", "\nAR", "\ncov", *headers):
         table.add_column(header, justify="right", no_wrap=True)
-    for kind, tags in slices.items():
+    digits = 2 if metrics["duration_s"] >= 3600 else 3
+    for kind, tags in metrics["slices"].items():
         for tag, part in tags.items():
-            exposure = (f"{part['hours']:.2f}", f"{part['km']:.1f}")
+            exposure = (f"{part['hours']:.{digits}f}", f"{part['km']:.{digits - 1}f}")
             for i, (name, method) in enumerate(part["methods"].items()):
                 first = (tag if kind == "scene" else f"{kind}: {tag}", exposure) if i == 0 else ("", ("", ""))
                 cells = [number(method[axis] and method[axis][figure], 3) for axis, figure in errors]
-                shares = (percent(method["ar"], 2), percent(method["coverage"]))
+                shares = (percent(method["ar"], ar_digits(metrics)), percent(method["coverage"]))
                 table.add_row(first[0], METHOD_NAMES.get(name, name), *first[1], *shares, *cells)
     return table
 
@@ -159,6 +160,11 @@ def _slice_table(slices: Metrics, *, wide: bool) -> Table:
 def _logs(logs: Metrics) -> str:
     failed = f"; {len(logs['failed'])} failed and are not in these figures" if logs["failed"] else ""
     return f"Logs: {logs['done']} of {logs['total']}{failed}."
+
+
+def ar_digits(metrics: Metrics) -> int:
+    """Of availability ratios: those of campaigns tell 99.99 from 99.999 %."""
+    return 3 if "logs" in metrics else 2
 
 
 def percent(share: float | None, digits: int = 1) -> str:
@@ -171,12 +177,16 @@ def percent(share: float | None, digits: int = 1) -> str:
 def _stretch_table(hidden: Metrics) -> Table:
     """Every stretch without GNSS: when, and how far off at its end."""
     table = bare_table(2)
+    named = any("log" in entry for entry in hidden["per_stretch"])  # a campaign's
+    if named:
+        table.add_column("\nlog", no_wrap=True)
     for header in ("hidden from\ns", "end error\nm", "sigma\nm", "error/\nsigma", "since GNSS\ns"):
         table.add_column(header, justify="right", no_wrap=True)
     for entry in hidden["per_stretch"]:
         error, sigma, since = entry["end_horizontal_m"], entry["end_sigma_m"], entry["since_gnss_s"]
         ratio = DASH if error is None else number(error / sigma, 2)
-        table.add_row(f"{entry['start_s']:.1f}", number(error, 3), number(sigma, 3), ratio, number(since, 1))
+        cells = (f"{entry['start_s']:.1f}", number(error, 3), number(sigma, 3), ratio, number(since, 1))
+        table.add_row(*([entry["log"]] if named else []), *cells)
     return table
 
 

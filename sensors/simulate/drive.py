@@ -24,8 +24,8 @@ from sensors.simulate.imu import ImuBiases, ImuSensor, ImuSimulation
 from sensors.simulate.network import NetworkPlan
 from sensors.simulate.noise import Nanoseconds, rows_between, stream
 from sensors.simulate.planning import PlannedDrive, plan_drive
-from sensors.simulate.pose_config import PoseFixSimulation
 from sensors.simulate.pose_fix import PoseFixSensor
+from sensors.simulate.pose_fix_config import PoseFixSimulation
 from sensors.simulate.reference import ReferenceSimulation, reference
 from sensors.simulate.route import CityPlan
 from sensors.simulate.scenes import ScenePlan, drive_tags
@@ -82,6 +82,10 @@ class DriveConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             raise EgolocError("imu.preset: expected no [vehicle.imu] beside it, got both")
         if self.network is not None and self.trajectory is not None:
             raise EgolocError("trajectory: expected no [network] beside it, got both")
+        for name in ("gnss_delay_s", "gnss_velocity_delay_s"):
+            if getattr(self.vehicle, name):
+                given = getattr(self.vehicle, name)
+                raise EgolocError(f"vehicle.{name}: expected 0 (stamps of simulated GNSS are exact), got {given:g}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -37,9 +37,9 @@ class Landmarks(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     degenerate_m: Positive = 60.0
     """Mean length of these stretches, m."""
     dash_alias_per_km: NonNegative = 0.0
-    """Places where the matcher may lock onto the next lane dash, 1/km."""
+    """Places where the matcher locks onto the next lane dash, 1/km."""
     lane_alias_per_km: NonNegative = 0.0
-    """Places where it may lock onto the next lane, 1/km."""
+    """Places where it locks onto the next lane, 1/km."""
 
 
 class Road(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

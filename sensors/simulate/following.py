@@ -1,5 +1,9 @@
-"""Along a given trajectory: control points of a motion that passes the places of a file at their times."""
+"""Along a given trajectory: control points of a motion that passes the places of a file at their times.
 
+Splines round off what they pass, so the control points are steered towards what they have missed, here round by round.
+"""
+
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,16 +11,17 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import uniform_filter1d
 
 from sensors.clock import seconds
 from sensors.datasets.trajectory_file import read_trajectory
 from sensors.errors import EgolocError
-from sensors.geodesy import MapFrame, llh_from_map
+from sensors.geodesy import MapFrame, llh_from_map, meridian_radius, transverse_radius
 from sensors.records import Trajectory
 from sensors.rotation import wrap, yaw_from_q
+from sensors.simulate import _road_kernels
 from sensors.simulate.driver import Driver, control_times
 from sensors.simulate.plane import Plane
-from sensors.simulate.steering import offsets, steered
 from sensors.simulate.trajectory import KNOT_S, MARGIN_S, Profile, Truth
 
 Floats = NDArray[np.float64]
@@ -86,6 +91,29 @@ def along(trajectory: Trajectory, frame: MapFrame, driver: Driver, name: str, lo
             f"{best.off_m:.1f} m off at {worst_s:.0f} s"
         )
     return best
+
+
+def offsets(llh: Floats, wanted: Floats) -> Floats:
+    """(N, 3) m east, north and up from llh (N, 3) to wanted (N, 3) nearby."""
+    lat, h = llh[:, 0], llh[:, 2]
+    metres = np.stack(((transverse_radius(lat) + h) * np.cos(lat), meridian_radius(lat) + h, np.ones_like(h)), axis=-1)
+    return (wanted - llh)[:, [1, 0, 2]] * metres
+
+
+def steered(
+    profile: Profile, truth: Truth, wanted: Floats, slack: tuple[float, float, float], smooth_s: float = 0.0
+) -> Profile:
+    """The profile of a truth, changed so that its knots (K + 1, 3) come nearer to wanted (K + 1, 3) llh.
+
+    slack: shares of the speed by which it may change along, across and up; smooth_s: length of the mean of the offsets.
+    """
+    error = offsets(truth.knots, wanted)
+    if smooth_s > 0:
+        error = uniform_filter1d(error, round(smooth_s / KNOT_S) | 1, axis=0, mode="nearest")
+    control = np.stack((profile.speed, profile.yaw, profile.grade, profile.roll), axis=-1)
+    _road_kernels.steer(control, error, KNOT_S, np.array(slack))
+    speed, yaw, grade, roll = control.T
+    return replace(profile, speed=speed, yaw=yaw, grade=grade, roll=roll)
 
 
 class _Path:

@@ -36,7 +36,7 @@ class GnssSensor:
     def sense(self, motion: Motion) -> tuple[GnssFix, GnssVelocity]:
         """Positions and velocities of the antenna where the solution is not lost; motion: truth at the next epochs."""
         config, count = self._config, len(motion.t_ns)
-        status, offset = self._history.at(motion.t_ns)
+        status, offset, doppler = self._history.at(motion.t_ns)
         sigma = np.where(status == GnssStatus.FIXED, config.fixed_sigma_m, config.float_sigma_m)
         sigmas = sigma[:, None] * np.array([1.0, 1.0, config.vertical_ratio])
         noise = self._noise.standard_normal((count, 7))
@@ -51,7 +51,7 @@ class GnssSensor:
             motion.rate,
             np.array(self._vehicle.gnss_lever_arm),
             sigmas * unit + offset,
-            velocity_sigmas * noise[:, 3:6],
+            velocity_sigmas * noise[:, 3:6] + doppler * np.linalg.norm(motion.vel_enu, axis=1)[:, None],
         )
         yaw, yaw_sigma = self._heading(motion, status, noise[:, 6])
         arrival_ns = self._delay.arrivals(motion.t_ns)

@@ -25,15 +25,17 @@ class GnssSimulation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lost_s: Positive = 5.0
     """Mean length of a loss, without any message, s."""
     refix_s: Positive = 4.0
-    """Mean time in float after a loss or a blocked stretch, s."""
+    """Mean time in float after a loss, a blocked stretch or a jump by reflections, s."""
     wrong_fix_per_hour: NonNegative = 0.0
     """How often ambiguities are fixed wrongly: the status says fixed, the sigma too, 1/h."""
     wrong_fix_s: Positive = 30.0
-    """Mean time until a wrong fix is noticed and done again, s."""
+    """Mean time until a wrong fix is noticed and done again, if nothing breaks it before, s."""
     wrong_fix_m: Positive = 1.5
     """Standard deviation of a wrong fix's offset, each horizontal axis, m."""
     multipath_s: Positive = 4.0
     """Mean length of a jump by reflections, in float with float's sigma; how far and how often is the Sky's, s."""
+    multipath_doppler: NonNegative = 0.02
+    """Standard deviation of the velocity's error meanwhile, each axis, as a share of the speed, -."""
     fixed_sigma_m: Positive = 0.015
     """Fixed solution, each horizontal axis, m."""
     float_sigma_m: Positive = 0.4

@@ -74,7 +74,7 @@ class ImuSimulation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     delay_s: NonNegative = 0.001
     """From measurement to arrival, s."""
     preset: PresetName | None = None
-    """A part by name, in place of the vehicle's ImuSpec, with its flaws."""
+    """A part typical of its class, in place of the vehicle's ImuSpec, with its flaws."""
     flaws: ImuFlaws | None = None
     """Scale, misalignment and sensitivity to temperature; default: the preset's, or none."""
     temperature: Temperature = Temperature()

@@ -1,7 +1,7 @@
-"""IMUs by name: what their datasheets say, and what else a part of that class does wrong.
+"""IMUs by name, each typical of a class: what a filter is told of it, and what else such a part does wrong.
 
-ImuSpec is what a filter is told. ImuFlaws are one sigma over parts, drawn anew for each drive; where a datasheet gives
-limits, a third of them is taken.
+No figure here was read from a manufacturer's sheet. `source` says which of them public pages give; all others are of
+the order usual for the part's class. ImuFlaws are one sigma over parts, drawn anew for each drive.
 """
 
 from typing import Literal, NamedTuple
@@ -32,12 +32,14 @@ class ImuFlaws(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ImuPreset(NamedTuple):
-    """One part."""
+    """A part like one on the market."""
 
     spec: ImuSpec
     flaws: ImuFlaws
+    like: str
+    """The part that it is like."""
     source: str
-    """Datasheet that the spec follows."""
+    """Which figures public pages give for it, and what kind of page."""
 
 
 PresetName = Literal["tactical", "tactical-fog-class", "automotive", "consumer"]
@@ -54,11 +56,12 @@ PRESETS: dict[PresetName, ImuPreset] = {
             gyro_scale_ppm_per_k=10.0,
             accel_scale_ppm_per_k=10.0,
         ),
-        "Seiko Epson M-G320PDG0 data sheet; NovAtel PwrPak7D-E1 product sheet",
+        "Epson G320N, the IMU of the NovAtel PwrPak7D-E1",
+        "that it is the PwrPak7D-E1's: NovAtel's OEM7 manual (RAWIMUSX); no figure",
     ),
     "tactical-fog-class": ImuPreset(
         ImuSpec(
-            name="honeywell-hg4930",
+            name="honeywell-hg4930-class",
             gyro_noise_deg_per_sqrt_h=0.04,
             accel_noise_m_per_s_per_sqrt_h=0.03,
             gyro_bias_instability_deg_per_h=0.25,
@@ -75,11 +78,12 @@ PRESETS: dict[PresetName, ImuPreset] = {
             gyro_scale_ppm_per_k=3.0,
             accel_scale_ppm_per_k=3.0,
         ),
-        "Honeywell HG4930CA51 data sheet (typical performance over temperature)",
+        "Honeywell HG4930",
+        "no figure",
     ),
     "automotive": ImuPreset(
         ImuSpec(
-            name="st-asm330lhh",
+            name="st-asm330lhh-class",
             gyro_noise_deg_per_sqrt_h=0.3,
             accel_noise_m_per_s_per_sqrt_h=0.035,
             gyro_bias_instability_deg_per_h=3.0,
@@ -96,11 +100,12 @@ PRESETS: dict[PresetName, ImuPreset] = {
             gyro_scale_ppm_per_k=70.0,
             accel_scale_ppm_per_k=100.0,
         ),
-        "STMicroelectronics ASM330LHH data sheet DocID031239 (5 mdps and 60 ug per sqrt(Hz), 0.005 dps/degC)",
+        "STMicroelectronics ASM330LHH",
+        "5 mdps and 60 ug per sqrt(Hz): within another simulator's ranges for it",
     ),
     "consumer": ImuPreset(
         ImuSpec(
-            name="bosch-bmi270",
+            name="bosch-bmi270-class",
             gyro_noise_deg_per_sqrt_h=0.42,
             accel_noise_m_per_s_per_sqrt_h=0.094,
             gyro_bias_instability_deg_per_h=10.0,
@@ -117,6 +122,7 @@ PRESETS: dict[PresetName, ImuPreset] = {
             gyro_scale_ppm_per_k=200.0,
             accel_scale_ppm_per_k=40.0,
         ),
-        "Bosch Sensortec BMI270 data sheet BST-BMI270-DS000 (7 mdps and 160 ug per sqrt(Hz), 0.5 dps, 20 mg)",
+        "Bosch Sensortec BMI270",
+        "7 mdps and 160 ug per sqrt(Hz), 0.5 dps: copies and users of sheet BST-BMI270-DS000",
     ),
 }

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sensors.simulate.course import Course
-from sensors.simulate.encounters import Episodes, lasting, met
-from sensors.simulate.pose_config import PoseFixSimulation
+from sensors.simulate.events import Episodes, lasting, met
+from sensors.simulate.pose_fix_config import PoseFixSimulation
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator

@@ -13,8 +13,8 @@ from sensors.bounds import Fraction, NonNegative, check_order
 from sensors.errors import EgolocError
 from sensors.simulate.environment import Environment
 from sensors.simulate.fields import Waves, gentle, hills, map_errors
-from sensors.simulate.lattice import Blocks, Graph, lay_out
 from sensors.simulate.noise import stream
+from sensors.simulate.streets import Blocks, Graph, lay_out
 from sensors.simulate.stretches import Stretches, ground_slope, lay_stretches
 from sensors.simulate.turns import Turns, turns_of
 

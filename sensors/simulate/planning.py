@@ -13,13 +13,12 @@ from sensors.simulate.course import BIAS_STEP_M, Course, bias_along
 from sensors.simulate.driver import Driver, Timetable, control_times, profile_along, timetable
 from sensors.simulate.environment import Environment
 from sensors.simulate.fields import map_errors
-from sensors.simulate.following import TrajectoryPlan, follow
+from sensors.simulate.following import TrajectoryPlan, follow, steered
 from sensors.simulate.itinerary import Itinerary, itinerary
 from sensors.simulate.network import Network, NetworkPlan, build_network
 from sensors.simulate.noise import stream
 from sensors.simulate.plane import Plane
 from sensors.simulate.route import CityPlan, city_route
-from sensors.simulate.steering import steered
 from sensors.simulate.trajectory import CHUNK, KNOT_S, MARGIN_S, Profile, Truth
 
 Floats = NDArray[np.float64]

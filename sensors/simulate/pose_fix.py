@@ -11,7 +11,7 @@ from sensors.rotation import wrap
 from sensors.simulate.course import Course
 from sensors.simulate.matching import MatchingHistory
 from sensors.simulate.noise import Delay, GaussMarkov, Rng, gauss_markov
-from sensors.simulate.pose_config import PoseFixSimulation
+from sensors.simulate.pose_fix_config import PoseFixSimulation
 from sensors.simulate.reference import yaw_in_map
 from sensors.simulate.trajectory import Motion
 from sensors.vehicle import Vehicle

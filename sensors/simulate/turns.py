@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sensors.simulate.lattice import Graph
+from sensors.simulate.streets import Graph
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]

@@ -13,12 +13,12 @@ from fusion.result import FusionResult, Reason, Sensor
 from fusion.run import run
 from fusion.state import E_ATTITUDE, E_GYRO_BIAS, E_VELOCITY
 from sensors.records import GnssFix, GnssVelocity, Log
-from sensors.rotation import q_from_rpy, rpy_from_q
+from sensors.rotation import q_from_rpy, rpy_from_q, wrap
 from sensors.simulate import scenarios
 from sensors.simulate.drive import Drive, simulate_drive
 from sensors.vehicle import Vehicle
 from tests.fusion.free import HONEST_FREE, Floats, at_rest, minus, nav_of
-from tests.fusion.scenes import later, only, without_yaw
+from tests.fusion.scenes import later, only, seconds, without_yaw
 
 PROMPT = msgspec.structs.replace(
     HONEST_FREE,
@@ -165,6 +165,60 @@ def test_pose_fixes_that_see_too_little_do_not_start(drives: list[Drive]) -> Non
     result = run(vague, PROMPT)
     assert result.aligned_ns is None
     assert (result.decisions.reason == Reason.BEFORE_ALIGNMENT).all()
+
+
+def test_a_vehicle_at_rest_starts_where_the_map_shows_yaw_badly() -> None:
+    """Stated yaw sigma 0.3 deg, at rest for ten seconds: no course could come to help."""
+    scene = scenarios.load("road-test")
+    vague = msgspec.structs.replace(scene.pose_fix, yaw_deg=0.29, yaw_spread=0.0, night_factor=1.0)
+    scene = msgspec.structs.replace(scene, pose_fix=vague)
+    for seed in range(100_000, 100_008):
+        drive = simulate_drive(10.0, seed, scene)
+        result = run(drive.log)
+        assert drive.log.imu is not None
+        assert result.aligned_ns is not None
+        assert result.aligned_ns - drive.log.imu.t_ns[0] < 1.5e9
+        yaw, true = (
+            rpy_from_q(q)[:, 2] for q in (result.states.q_enu_body, drive.truth.at(result.states.t_ns).q_enu_body)
+        )
+        assert np.degrees(np.abs(wrap(yaw - true))).max() < 1.0
+
+
+@pytest.mark.parametrize(("wrong", "wrong_s", "waits_s"), [("pose_fixes", 0.6, 0.6), ("gnss", 5.0, 1.0)])
+def test_a_contradiction_waits_a_second_and_the_pose_fix_wins(
+    drives: list[Drive], wrong: str, wrong_s: float, waits_s: float
+) -> None:
+    """The first fixes are 2 m and 12 deg off; or GNSS is 15 m off, as under a canyon's multipath."""
+    for drive in drives[:8]:
+        log = without_yaw(only(drive.log, "pose_fixes", "gnss", "gnss_velocity"))
+        assert log.pose_fixes is not None
+        assert log.gnss is not None
+        off = seconds(log, getattr(log, wrong).t_ns) < wrong_s
+        if wrong == "pose_fixes":
+            pose = log.pose_fixes.pose + off[:, None] * np.array([1.6, 1.2, 0.2])
+            log = replace(log, pose_fixes=replace(log.pose_fixes, pose=pose))
+        else:
+            llh = log.gnss.llh + off[:, None] * np.array([15.0 / 6.4e6, 0.0, 0.0])
+            log = replace(log, gnss=replace(log.gnss, llh=llh))
+        result = run(log, PROMPT)
+        assert log.imu is not None
+        assert result.aligned_ns is not None
+        assert waits_s <= (result.aligned_ns - log.imu.t_ns[0]) * 1e-9 < waits_s + 0.4
+        assert (np.abs(first_errors(result, drive)[[0, 1, 8]]) < 4.0).all()
+
+
+def test_a_pose_fix_that_does_not_see_along_the_road_starts_at_the_gnss_position(drives: list[Drive]) -> None:
+    for drive in drives[:8]:
+        log = without_yaw(only(drive.log, "pose_fixes", "gnss", "gnss_velocity"))
+        assert log.pose_fixes is not None
+        assert log.imu is not None
+        blind = log.pose_fixes.cov + np.diag([2.0**2, 2.0**2, 0.0])
+        moved = log.pose_fixes.pose + np.array([1.5, -1.5, 0.0])
+        result = run(replace(log, pose_fixes=replace(log.pose_fixes, pose=moved, cov=blind)), PROMPT)
+        assert result.aligned_ns is not None
+        assert result.aligned_ns - log.imu.t_ns[0] < 0.5e9
+        assert (np.abs(first_errors(result, drive)[:3]) < 4.0).all()
+        assert result.states.sigma[0, :2].max() < 0.1
 
 
 def test_a_course_from_positions_waits_for_the_end_of_a_turn(drives: list[Drive]) -> None:

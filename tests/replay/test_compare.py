@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
+from fusion.result import Sensor
 from replay.cli import main
 from replay.compare import FIGURES, SUMMED, Pairs, compare, figures, intervals, paired
 from replay.comparison import print_comparison
@@ -108,6 +109,20 @@ class TestRuns:
         assert (found["pairs"], found["only_a"], found["only_b"]) == (24, 12, 12)
         both = metrics_of(merge([("drive-1", log(1, 0.5)), ("drive-2", log(2))]))["methods"]["fusion"]
         assert find(found, "all", "", "fusion", "lat_mae")["b"] == pytest.approx(both["lat"]["mae"], rel=1e-12)
+
+    def test_a_method_counts_where_both_evaluated_it(self, tmp_path: Path) -> None:
+        """Of B's two logs one has no pose fixes: A's EgoVM is compared over the other alone."""
+        states, decisions = tables(2, SECONDS)
+        others = decisions["sensor"] != Sensor.POSE_FIX
+        without = {name: column[others] for name, column in decisions.items()}
+        part = scored(batches(states, without, NO_CUTS), LIMITS["paper"], facts(), "drive-2")
+        a = campaign(tmp_path / "a", {"drive-1": log(1), "drive-2": log(2)})
+        b = campaign(tmp_path / "b", {"drive-1": log(1), "drive-2": part})
+        row = find(compare(a, b, resamples=10), "all", "", "egovm", "lon_mae")
+        own = metrics_of(log(1))["methods"]["egovm"]["lon"]["mae"]
+        assert (row["a"], row["b"]) == pytest.approx((own, own), rel=1e-12)
+        assert row["difference"] == row["low"] == row["high"] == 0
+        assert find(compare(a, b, resamples=10), "all", "", "fusion", "lon_mae")["difference"] == 0
 
     def test_a_campaign_with_one_of_its_logs(self, tmp_path: Path) -> None:
         a = campaign(tmp_path / "a", {f"drive-{seed}": log(seed) for seed in range(3)})

@@ -12,7 +12,7 @@ from fusion.result import Sensor
 from replay.config import LIMITS
 from replay.metrics import metrics_of
 from replay.segments import NUMBERS
-from replay.sums import Sums
+from replay.sums import Sums, merge
 from sensors.clock import NS_PER_S
 from tests.replay.made_up_tables import PERIOD_NS, SCENES, START_NS, batches, facts, scored, tables
 
@@ -183,6 +183,18 @@ def test_a_slice_of_seconds_is_not_evaluated() -> None:
     assert slices["tunnel"]["epochs"] > 0
     assert set(slices["tunnel"]["methods"]["fusion"].values()) == {None}
     assert slices["city"]["methods"]["fusion"]["ar"] > 0
+
+
+def test_a_method_that_a_slice_has_for_seconds_only_is_not_evaluated_there() -> None:
+    """Of two logs of tunnel, the one with pose fixes is there for nine seconds."""
+    scene = np.where(TABLES[0]["t_ns"] < START_NS + 9 * NS_PER_S, 3, 1).astype(np.int16)
+    short = scored(batches({**TABLES[0], "scene": scene}, TABLES[1], np.empty(0, np.int64)), PAPER, facts())
+    long = {**TABLES[0], "scene": np.full_like(scene, 3)}
+    others = {name: column[TABLES[1]["sensor"] != Sensor.POSE_FIX] for name, column in TABLES[1].items()}
+    both = merge([("short", short), ("long", scored(batches(long, others, np.empty(0, np.int64)), PAPER, facts()))])
+    tunnel = metrics_of(both)["slices"]["scene"]["tunnel"]["methods"]
+    assert tunnel["fusion"]["ar"] > 0
+    assert set(tunnel["egovm"].values()) == {None}
 
 
 def test_hidden_stretches_end_at_their_last_known_epoch() -> None:

@@ -120,6 +120,16 @@ def tagged() -> Assembled:
     return assemble(log, RunConfig(), result)
 
 
+def test_hidden_stretches_of_a_campaign_name_their_logs() -> None:
+    log, result = drive(200.0, state_error=(0.3, 0.4, 0.0), with_reference=False)
+    sums = assemble(log, RunConfig(hide_gnss=HideGnss(60.0, 15.0)), result).sums(RunConfig().limits)
+    logs = {"total": 2, "done": 2, "failed": []}
+    lines = printed(scores.metrics_of(merge([("drive-a", sums), ("drive-b", sums)]), logs), 80).splitlines()
+    found = [line.split()[:3] for line in lines if line.startswith("drive-")]
+    starts = ("60.0", "120.0", "180.0")
+    assert found == [[name, start, "0.500"] for name in ("drive-a", "drive-b") for start in starts]
+
+
 @pytest.mark.parametrize("width", [80, 132])
 def test_slices_have_exposure_and_a_line_a_method(width: int) -> None:
     text = printed(tagged().metrics, width)
@@ -127,8 +137,8 @@ def test_slices_have_exposure_and_a_line_a_method(width: int) -> None:
     assert "…" not in text
     lines = [line.split() for line in text.splitlines()]
     assert [line[:6] for line in lines if line[:1] in (["city"], ["tunnel"], ["night"])] == [
-        ["city", "GNSS-RTK", "0.01", "0.2", "100", "100"],
-        *([tag, "GNSS-RTK", "0.01", "0.4", "100", "100"] for tag in ("night", "tunnel")),
+        ["city", "GNSS-RTK", "0.006", "0.20", "100", "100"],
+        *([tag, "GNSS-RTK", "0.011", "0.40", "100", "100"] for tag in ("night", "tunnel")),
     ]
     assert [line[:3] for line in lines if line[:1] == ["mode:"]] == [["mode:", "autonomous", "GNSS-RTK"]]
     errors = ["0.120", "0.120", "0.350", "0.350", "0.286", "0.286"] if width > 100 else ["0.120", "0.350", "0.286"]
@@ -146,6 +156,7 @@ def campaign(*failed: dict[str, str]) -> dict[str, Any]:
 def test_a_campaign_says_how_many_logs_and_how_far() -> None:
     text = printed(campaign(), 132)
     assert "Logs: 60 of 60." in text
+    assert row(text, "EgoVM")[:3] == ["EgoVM", "0.000", "100"]
     assert "Scored: 35940 epochs, 3594.0 s, 35.9" in text
     assert row(text, "Fusion")[:4] == ["Fusion", "100", "100", "0.050"]
     assert text.count("The filter lost track.") == 3

@@ -1,4 +1,4 @@
-"""Hand-made courses and truths for tests of single sensor models."""
+"""Hand-made courses, truths and a silent IMU for tests of single sensor models."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,9 +7,18 @@ from sensors.simulate.course import Course
 from sensors.simulate.environment import Environment
 from sensors.simulate.noise import GaussMarkov
 from sensors.simulate.trajectory import KNOT_S, MARGIN_S, Profile, Truth
+from sensors.vehicle import ImuSpec
 
 START_NS = 1_700_000_000_000_000_000
 MAP_SCALE_M = 300.0
+QUIET = ImuSpec(
+    gyro_noise_deg_per_sqrt_h=0.0,
+    accel_noise_m_per_s_per_sqrt_h=0.0,
+    gyro_bias_instability_deg_per_h=0.0,
+    accel_bias_instability_mg=0.0,
+    gyro_turn_on_bias_deg_per_h=0.0,
+    accel_turn_on_bias_mg=0.0,
+)
 
 
 def straight(duration_s: float, speed: float = 10.0, *parts: tuple[float, str, Environment], seed: int = 0) -> Course:

@@ -1,6 +1,6 @@
 """GNSS-RTK alone and EgoVM alone on a scenario, against the truth: the rows that road-test is set by.
 
-    python -m tests.sensors.simulate.sensor_rows [--scenario road-test] [--drives 100] [--seed 100000] [--network 0]
+    python -m tests.sensors.simulate.sensor_rows [--scenario road-test] [--drives 100] [--seed 100000] [--network 0 ...]
 
 No filter runs here. Definitions are those of docs/metrics.md: a fix stands for the time back to the one before it, 1.5
 periods at most; AR counts all time from the reference's start on, MAE and RMSE the fixes.
@@ -9,6 +9,7 @@ periods at most; AR counts all time from the reference's start on, MAE and RMSE 
 import argparse
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,10 +74,14 @@ class Row:
         return found
 
 
-def rows(config: DriveConfig, seeds: range) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
-    """Both rows, and kilometres by scene tag, over drives of these seeds."""
+def rows(
+    config: DriveConfig, seeds: range, networks: Sequence[int]
+) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
+    """Both rows, and kilometres by scene tag, over drives of these seeds, on each of the networks in turn."""
+    fleet = [msgspec.structs.replace(config, network_seed=network) for network in networks]
     gnss, egovm, km = Row(), Row(), Counter[str]()
-    for seed in seeds:
+    for index, seed in enumerate(seeds):
+        config = fleet[index % len(fleet)]
         planned = plan(None, seed, config)
         truth, course = planned.truth, planned.course
         begin = truth.start_ns + round(config.reference.start_s * 1e9)
@@ -120,10 +125,11 @@ def main() -> None:
     parser.add_argument("--scenario", default="road-test")
     parser.add_argument("--drives", type=int, default=100)
     parser.add_argument("--seed", type=int, default=100_000)
-    parser.add_argument("--network", type=int, default=0, help="seed of the roads; the scenario's are for reports")
+    parser.add_argument(
+        "--network", type=int, nargs="+", default=[0], help="seeds of roads; the scenario's own are for reports"
+    )
     given = parser.parse_args()
-    config = msgspec.structs.replace(load(given.scenario), network_seed=given.network)
-    found, km = rows(config, range(given.seed, given.seed + given.drives))
+    found, km = rows(load(given.scenario), range(given.seed, given.seed + given.drives), given.network)
     show(found)
     print("  ".join(f"{name} {length:.1f} km" for name, length in sorted(km.items())))
 

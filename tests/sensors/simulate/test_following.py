@@ -13,9 +13,8 @@ from sensors.records import Trajectory
 from sensors.rotation import q_from_rpy, rpy_from_q
 from sensors.simulate.driver import Driver
 from sensors.simulate.environment import Environment
-from sensors.simulate.following import TrajectoryPlan, along
+from sensors.simulate.following import TrajectoryPlan, along, offsets
 from sensors.simulate.planning import plan_drive
-from sensors.simulate.steering import offsets
 from tests.sensors.simulate.roads import START_LLH
 
 Floats = NDArray[np.float64]

@@ -13,12 +13,12 @@ from sensors.simulate import scenarios
 from sensors.simulate.corners import Corners, round_off
 from sensors.simulate.drive import plan
 from sensors.simulate.driver import Driver
+from sensors.simulate.following import offsets
 from sensors.simulate.itinerary import Itinerary, itinerary
 from sensors.simulate.network import Network, build_network
 from sensors.simulate.plane import Plane
 from sensors.simulate.planning import PlannedDrive, plan_drive
 from sensors.simulate.route import CityPlan, Route
-from sensors.simulate.steering import offsets
 from tests.sensors.simulate.roads import ENVIRONMENTS, PLAN, START_LLH, START_NS
 
 Floats = NDArray[np.float64]

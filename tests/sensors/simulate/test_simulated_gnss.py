@@ -57,7 +57,7 @@ def test_correlated_errors_have_the_stated_covariance_and_memory(truth: Truth) -
 def test_schedule_is_fixed_most_of_the_time_and_floats_after_a_loss() -> None:
     config = GnssSimulation()
     t_ns = epochs(100 * 3600.0, 10.0)
-    status, offset = RtkHistory(straight(100 * 3600.0), config, np.random.default_rng(0)).at(t_ns)
+    status, offset, _ = RtkHistory(straight(100 * 3600.0), config, np.random.default_rng(0)).at(t_ns)
     assert not offset.any()
     assert np.mean(status == GnssStatus.FIXED) == pytest.approx(0.94, abs=0.02)
     begins = np.flatnonzero(np.diff(status)) + 1

@@ -10,15 +10,7 @@ from sensors.simulate.imu import STANDARD_GRAVITY, simulate_imu
 from sensors.simulate.noise import stamps
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import ImuSpec
-
-QUIET = ImuSpec(
-    gyro_noise_deg_per_sqrt_h=0.0,
-    accel_noise_m_per_s_per_sqrt_h=0.0,
-    gyro_bias_instability_deg_per_h=0.0,
-    accel_bias_instability_mg=0.0,
-    gyro_turn_on_bias_deg_per_h=0.0,
-    accel_turn_on_bias_mg=0.0,
-)
+from tests.sensors.simulate.courses import QUIET
 
 
 @pytest.fixture(scope="module")

@@ -11,18 +11,9 @@ from sensors.simulate.imu import STANDARD_GRAVITY, ImuSensor, ImuSimulation, Tem
 from sensors.simulate.imu_presets import PRESETS, ImuFlaws, PresetName
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import ImuSpec, Vehicle
-from tests.sensors.simulate.courses import cruise, epochs, straight
+from tests.sensors.simulate.courses import QUIET, cruise, epochs, straight
 
 Floats = NDArray[np.float64]
-
-QUIET = ImuSpec(
-    gyro_noise_deg_per_sqrt_h=0.0,
-    accel_noise_m_per_s_per_sqrt_h=0.0,
-    gyro_bias_instability_deg_per_h=0.0,
-    accel_bias_instability_mg=0.0,
-    gyro_turn_on_bias_deg_per_h=0.0,
-    accel_turn_on_bias_mg=0.0,
-)
 
 
 def errors(
@@ -48,12 +39,17 @@ def test_a_preset_puts_its_datasheet_into_the_log(name: PresetName) -> None:
     assert np.degrees(white.std()) * 6 == pytest.approx(spec.gyro_noise_deg_per_sqrt_h, rel=0.1)
 
 
-def test_presets_are_ordered_by_grade_and_name_their_source() -> None:
+def test_presets_are_ordered_by_grade_and_keep_to_what_is_quoted_of_their_parts() -> None:
     grades = [PRESETS[name] for name in ("tactical-fog-class", "tactical", "automotive", "consumer")]
     for column in ("gyro_noise_deg_per_sqrt_h", "gyro_turn_on_bias_deg_per_h"):
         values = [getattr(preset.spec, column) for preset in grades]
         assert values == sorted(values)
-    assert all("data sheet" in preset.source for preset in PRESETS.values())
+    for name, density_mdps, density_ug, turn_on_dps in (("automotive", 5.0, 60.0, None), ("consumer", 7.0, 160.0, 0.5)):
+        spec = PRESETS[name].spec
+        assert spec.gyro_noise_deg_per_sqrt_h == pytest.approx(density_mdps * 1e-3 * 60.0)
+        assert spec.accel_noise_m_per_s_per_sqrt_h == pytest.approx(density_ug * 1e-6 * STANDARD_GRAVITY * 60, rel=0.01)
+        assert turn_on_dps is None or spec.gyro_turn_on_bias_deg_per_h == turn_on_dps * 3600.0
+        assert f"{density_mdps:g} mdps and {density_ug:g} ug" in PRESETS[name].source
 
 
 def test_a_preset_beside_a_datasheet_is_refused() -> None:

@@ -12,8 +12,8 @@ from sensors.rotation import wrap
 from sensors.simulate.course import Course
 from sensors.simulate.drive import DriveConfig
 from sensors.simulate.environment import Environment, Landmarks
-from sensors.simulate.pose_config import PoseFixSimulation
 from sensors.simulate.pose_fix import PoseFixSensor
+from sensors.simulate.pose_fix_config import PoseFixSimulation
 from sensors.simulate.reference import yaw_in_map
 from sensors.vehicle import Vehicle
 from tests.sensors.simulate.courses import cruise, epochs, straight

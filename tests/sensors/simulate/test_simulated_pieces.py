@@ -64,7 +64,9 @@ def same(one: Log, other: Log) -> bool:
     return one.vehicle == other.vehicle and one.map_frame == other.map_frame
 
 
-@pytest.mark.parametrize("config", [DriveConfig(), BUSY], ids=["plain", "busy"])
+@pytest.mark.parametrize(
+    "config", [DriveConfig(), BUSY, scenarios.load("road-test")], ids=["plain", "busy", "road-test"]
+)
 @pytest.mark.parametrize("piece_s", [7.31, 60.0, 300.0])
 def test_a_drive_is_the_same_bit_for_bit_however_it_is_cut(config: DriveConfig, piece_s: float) -> None:
     whole = list(simulate_pieces(400.0, 3, config, piece_s=1e6))
@@ -126,6 +128,14 @@ def test_the_sky_of_the_tunnel_is_where_its_tag_says() -> None:
     assert np.char.startswith(log.scene.text, "tunnel").any()
     # a fix at the very edge may be on either side of it by rounding
     assert in_tunnel.sum() <= np.char.startswith(log.scene.text, "tunnel").sum()
+
+
+def test_delays_of_gnss_stamps_are_refused() -> None:
+    vehicle = {"vehicle": {"gnss_velocity_delay_s": 0.1}}
+    with pytest.raises(
+        (msgspec.ValidationError, EgolocError), match=r"vehicle\.gnss_velocity_delay_s: expected 0 .*0\.1"
+    ):
+        msgspec.convert(vehicle, DriveConfig)
 
 
 def test_a_drive_ends_after_its_length_or_its_duration() -> None:

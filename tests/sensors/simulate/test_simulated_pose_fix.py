@@ -11,8 +11,8 @@ from sensors.records import PoseFix
 from sensors.rotation import wrap
 from sensors.simulate.drive import Drive, DriveConfig, Start, featureless, simulate_drive
 from sensors.simulate.noise import stamps
-from sensors.simulate.pose_config import PoseFixSimulation
 from sensors.simulate.pose_fix import PoseFixSensor
+from sensors.simulate.pose_fix_config import PoseFixSimulation
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import Vehicle
 

@@ -1,4 +1,4 @@
-"""What a drive meets on its way: events at random along a course, as often as each stretch's surroundings make them."""
+"""Random events along a course: how often follows from the environments that a drive passes, how long is drawn."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,8 +14,9 @@ Floats = NDArray[np.float64]
 Rng = np.random.Generator
 
 
-class Stretches(NamedTuple):
-    """A course as stretches: time (M + 1,) s since its start, place (M + 1,) m, kind (M,) index of the environment."""
+class Passage(NamedTuple):
+    """The stretches that a drive passes: time (M + 1,) s since its start, place (M + 1,) m, kind (M,) index of the
+    environment."""
 
     time: Floats
     place: Floats
@@ -37,14 +38,14 @@ class Episodes(NamedTuple):
         return row, (last >= 0) & (x < self.end[row])
 
 
-def stretches(course: Course) -> Stretches:
-    """The stretches that a drive passes."""
+def passage(course: Course) -> Passage:
+    """When and where each of them is passed."""
     first, last = course.s[0], course.s[-1]
     inner = course.edges[(course.edges > first) & (course.edges < last)]
     place = np.concatenate(([first], inner, [last]))
     t = seconds(course.t_ns, course.t_ns[0])
     time = np.concatenate(([0.0], np.interp(inner, course.s, t), t[-1:]))
-    return Stretches(time, place, course.environment(0.5 * (place[1:] + place[:-1])))
+    return Passage(time, place, course.environment(0.5 * (place[1:] + place[:-1])))
 
 
 def met(course: Course, rate: Callable[[Environment], float], rng: Rng, *, over_place: bool = False) -> Floats:
@@ -52,7 +53,7 @@ def met(course: Course, rate: Callable[[Environment], float], rng: Rng, *, over_
 
     rate: events per hour, or per km.
     """
-    way = stretches(course)
+    way = passage(course)
     at, unit = (way.place, 1000.0) if over_place else (way.time, 3600.0)
     rates = np.array([rate(environment) for environment in course.environments]) / unit
     expected = np.concatenate(([0.0], np.cumsum(rates[way.kind] * np.diff(at))))
