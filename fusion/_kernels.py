@@ -14,7 +14,7 @@ from fusion.gating import correct, innovate, observed_directions, whiten
 from fusion.measurements import gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
-from fusion.recovery import believed, doubted
+from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, Core, Floats
 from sensors._kernels import radii
@@ -24,11 +24,11 @@ _GNSS_POSITION = int(Sensor.GNSS_POSITION)
 _GNSS_VELOCITY = int(Sensor.GNSS_VELOCITY)
 _GNSS_YAW = int(Sensor.GNSS_YAW)
 _POSE_FIX = int(Sensor.POSE_FIX)
-_WHEEL = int(Sensor.WHEEL)
 _ACCEPTED = int(Reason.ACCEPTED)
 _PARTLY = int(Reason.PARTLY_ACCEPTED)
 _CHI_SQUARE = int(Reason.CHI_SQUARE)
 _COVARIANCE = int(Reason.COVARIANCE)
+_RECEIVER = int(Reason.RECEIVER)
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
@@ -190,6 +190,9 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
         kind, dof = motion(core, par, ev.t[e], rate)
         if dof == 0:
             return
+    elif kind == _GNSS_VELOCITY and in_doubt(core, 0, ev.t[e]):
+        _record(rec, e, kind, 0, _RECEIVER)
+        return
     else:
         dof = _measure(core, par, m, kind, ev.row[e], rate)
         if dof == 0:

@@ -73,7 +73,7 @@ def rotation(q: Quaternion) -> Matrix:
 
 @kernel()
 def attitude(nav: NDArray[np.float64]) -> Matrix:
-    """R_enu_body of nav (16,)."""
+    """R_enu_body of nav (17,)."""
     r: Matrix = rotation((nav[6], nav[7], nav[8], nav[9]))
     return r
 

@@ -7,7 +7,7 @@ state is not applied (arrival order, with rewinding, is a matter of ordering and
 from fusion.config import FusionConfig
 from fusion.navigator import Navigator
 from fusion.result import Decisions, States
-from fusion.state import Core, Floats
+from fusion.state import C_STATE, Core, Floats
 from sensors.geodesy import MapFrame
 from sensors.records import GnssFix, GnssVelocity, Imu, Log, PoseFix, WheelSpeed
 from sensors.vehicle import Vehicle
@@ -39,7 +39,7 @@ class Localizer:
     @property
     def t_ns(self) -> int | None:
         """Time of the state; None before alignment."""
-        return None if self.core is None else int(self.core.clock[0])
+        return None if self.core is None else int(self.core.clock[C_STATE])
 
     def push(self, record: Imu | Measurement) -> None:
         """Take an IMU record or a measurement. IMU stamps must rise; raises EgolocError where they do not."""

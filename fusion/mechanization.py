@@ -51,7 +51,7 @@ def refresh(nav: Floats, earth: Floats) -> None:
 
 @kernel()
 def strapdown(nav: Floats, earth: Floats, turn: Vector, dv: Vector, dt: float) -> None:
-    """Advance nav (16,) in place by dt.
+    """Advance nav (17,) in place by dt.
 
     turn: rotation vector of the body against inertial space, body axes; dv: specific force integrated, ENU axes at the
     start. Second order in dt: Coriolis, transport and gravity at mid-step, position by the trapezoid of velocity.

@@ -7,7 +7,7 @@ from fusion.events import Parameters
 from fusion.gating import correct, innovate, whiten
 from fusion.measurements import body_velocity
 from fusion.result import Sensor
-from fusion.state import C_COUNT, C_TICK, RING_SIZE, Core, Floats, Nanoseconds
+from fusion.state import C_COUNT, C_TICK, E_WHEEL_SCALE, RING_SIZE, Core, Floats, Nanoseconds
 from sensors._kernels import EARTH_RATE
 from sensors.kernel import kernel
 
@@ -106,7 +106,7 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     if not par.non_holonomic or speed < par.min_speed:
         return _NON_HOLONOMIC, 0
     velocity = body_velocity(nav, attitude(nav), core.H, par.axle, rate)
-    for j in range(15):  # lateral and vertical rows first
+    for j in range(E_WHEEL_SCALE):  # lateral and vertical rows first
         core.H[0, j], core.H[1, j], core.H[2, j] = core.H[1, j], core.H[2, j], 0.0
     extra = (par.per_speed * speed) ** 2
     R[0, 0], R[1, 1] = par.lateral_var + extra, par.vertical_var + extra

@@ -19,6 +19,7 @@ from fusion.result import Decisions, Reason, States
 from fusion.sources import APPLY, RECORDS, joined, sources, split
 from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, Core, new_core
 from fusion.timeline import merge, parameters
+from sensors import pieces
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
@@ -77,7 +78,7 @@ class Navigator:
         """Go on to known_ns at most, the time up to which every measurement has been added."""
         if not self._imu:
             return
-        imu = _joined(self._imu)
+        imu: Imu = pieces.joined(self._imu)
         core = self.core or self._align(imu, min(known_ns, self.last_imu_ns))
         if core is None:
             self._imu = [imu[int(np.searchsorted(imu.t_ns, known_ns - self._kept_ns)) :]]
@@ -96,12 +97,12 @@ class Navigator:
     def take_states(self) -> States:
         """States recorded since the last call."""
         taken, self._states = self._states, []
-        return join(States, taken or [states(new_recorder(0, 0))])
+        return join(taken or [states(new_recorder(0, 0))])
 
     def take_decisions(self) -> Decisions:
         """Decisions since the last call, in the order of application."""
         taken, self._decisions = self._decisions, []
-        return join(Decisions, taken or [unused(self._nothing, Reason.LATE)])
+        return join(taken or [unused(self._nothing, Reason.LATE)])
 
     def _align(self, imu: Imu, known_ns: int) -> Core | None:
         """Offer pending measurements up to known_ns in stamp order until one completes a first state."""
@@ -168,10 +169,3 @@ def _read_only(column: NDArray[Scalar]) -> NDArray[Scalar]:
     view = np.ascontiguousarray(column).view()
     view.flags.writeable = False
     return view
-
-
-def _joined(parts: list[Imu]) -> Imu:
-    if len(parts) == 1:
-        return parts[0]
-    names = Imu.__dataclass_fields__
-    return Imu(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

@@ -12,6 +12,7 @@ from fusion.result import Decisions, Reason, States
 from fusion.sources import APPLY, Sources
 from fusion.state import ACCEL_BIAS, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Floats
 from fusion.timeline import Timeline
+from sensors.pieces import joined
 
 Columns = TypeVar("Columns", States, Decisions)
 
@@ -76,10 +77,7 @@ def unused(found: Sources, reason: Reason, initial: Initial | None = None) -> De
     )
 
 
-def join(kind: type[Columns], parts: Sequence[Columns]) -> Columns:
-    """Records one after the other."""
-    filled = [part for part in parts if len(part.t_ns)] or parts[:1]
-    if len(filled) == 1:
-        return filled[0]
-    names = kind.__dataclass_fields__
-    return kind(**{name: np.concatenate([getattr(part, name) for part in filled]) for name in names})
+def join(parts: Sequence[Columns]) -> Columns:
+    """Records (one or more) one after the other."""
+    whole: Columns = joined([part for part in parts if len(part.t_ns)] or [parts[0]])
+    return whole

@@ -32,6 +32,14 @@ def believed(core: Core, which: int) -> None:
 
 
 @kernel()
+def in_doubt(core: Core, which: int, now: int) -> bool:
+    """Whether the last position of sensor which was rejected, just now."""
+    clock = core.doubt_clock
+    fresh: bool = clock[which, D_COUNT] > 0 and now - clock[which, D_TIME] <= FRESH_NS
+    return fresh
+
+
+@kernel()
 def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now: int) -> None:
     """A position of sensor which was rejected: innovation z and core.R in axes whose first lies at ahead (cos, sin).
 

@@ -42,6 +42,8 @@ class Reason(IntEnum):
     USED_FOR_ALIGNMENT = 8
     LATE = 9
     """Older than the state when it came (live use)."""
+    RECEIVER = 10
+    """GNSS velocity: the receiver's position was rejected at the same time, and reflections upset both."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

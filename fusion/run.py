@@ -5,11 +5,12 @@ import numpy as np
 from fusion.config import FusionConfig
 from fusion.navigator import Navigator
 from fusion.recording import join
-from fusion.result import Decisions, FusionResult, Reason, States
+from fusion.result import FusionResult, Reason
 from fusion.sources import RECORDS
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
+from sensors.pieces import summed
 from sensors.records import LeftOut, Log
 from sensors.vehicle import Vehicle
 
@@ -82,14 +83,11 @@ def run(log: Log, config: FusionConfig | None = None) -> FusionResult:
 
 def joined(results: list[FusionResult]) -> FusionResult:
     """The result of a drive from those of its pieces."""
-    counts: dict[tuple[str, str], int] = {}
-    for entry in (entry for result in results for entry in result.left_out):
-        counts[entry.source, entry.reason] = counts.get((entry.source, entry.reason), 0) + entry.count
     return FusionResult(
-        join(States, [result.states for result in results]),
-        join(Decisions, [result.decisions for result in results]),
+        join([result.states for result in results]),
+        join([result.decisions for result in results]),
         results[-1].aligned_ns,
-        tuple(LeftOut(source, reason, count) for (source, reason), count in counts.items()),
+        summed(entry for result in results for entry in result.left_out),
     )
 
 

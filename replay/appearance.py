@@ -16,6 +16,7 @@ GATE_COLOURS = {
     "chi_square": 0xC0453CFF,
     "covariance": 0xC77F2CFF,
     "status": 0xA06A2AFF,
+    "receiver": 0x9A4F6EFF,
 }
 WIDTHS = (4.0, 2.8, 1.8, 0.8)
 """Of the tracks, in the palettes' order, screen points."""

@@ -7,9 +7,9 @@ come by a rename. Resuming takes those over that are readable and of the same lo
 import hashlib
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 
 from replay.batch import Backend, End, Job, Outcome, Work, in_process
-from replay.campaign_folder import KIND, campaign_folder, error_file
+from replay.campaign_folder import KIND, campaign_folder, check_place, error_file
 from replay.config import to_toml
 from replay.finished import reference_facts, why_not_finished
 from replay.metrics import metrics_of
@@ -36,21 +36,25 @@ class Campaign:
     logs: dict[str, Any]
 
 
-def backend_of(logs: int, workers: int | None = None, ray: str | None = None) -> Backend:
+@contextmanager
+def backend_of(logs: int, workers: int | None = None, ray: str | None = None) -> Iterator[Backend]:
     """What replays so many logs: a Ray cluster by its address, workers of this machine, or this process.
 
-    workers: None for as many as there are cores.
+    workers: None for as many as there are cores. A cluster is joined for the time of the block.
     """
     if ray is not None:
         from replay import cluster
 
-        return partial(cluster.run, address=ray)
+        with cluster.joined(ray) as api:
+            yield partial(cluster.run, ray=api)
+        return
     count = min(workers or available_cores(), logs)
     if count == 1:
-        return in_process
+        yield in_process
+        return
     from replay import pool
 
-    return partial(pool.run, workers=count)
+    yield partial(pool.run, workers=count)
 
 
 def available_cores() -> int:
@@ -62,7 +66,7 @@ def run_campaign(
     sources: Sequence[LogSource],
     out: Path,
     job: Job,
-    backend: Backend,
+    backend: AbstractContextManager[Backend],
     *,
     resume: bool = False,
     overwrite: bool = False,
@@ -70,16 +74,18 @@ def run_campaign(
     """Replay logs into out/<name> each and merge what they add up to.
 
     A log that fails is told in metrics.json and <name>.error.txt. Raises StorageError where the folder cannot be
-    written, EgolocError where it is not free; what is finished by then stays.
+    written, EgolocError where it is not free; what is finished by then stays. backend: entered before anything is
+    written or replaced.
     """
     named = check_unique(sources)
     manifest = _manifest(list(named.values()), job)
-    with campaign_folder(out, manifest, job.config, resume=resume, overwrite=overwrite) as begun:
+    check_place(out, resume=resume, overwrite=overwrite)
+    with backend as replay, campaign_folder(out, manifest, job.config, resume=resume, overwrite=overwrite) as begun:
         job = replace(job, command=tuple(begun["command"]))
         left = _left(list(named.values()), out, job)
         with storage(out):  # there are metrics of all logs or none
             (out / "metrics.json").unlink(missing_ok=True)
-        failed = _run([Work(source, out / source.name) for source in left], out, job, backend)
+        failed = _run([Work(source, out / source.name) for source in left], out, job, replay)
         with storage(out):
             return _merged(out, list(named), failed)
 

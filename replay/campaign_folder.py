@@ -1,22 +1,22 @@
 """The folder of a campaign: made new, taken up again or refused; one process at a time writes there."""
 
+import json
 import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from replay.config import RunConfig, to_toml
 from replay.run_files import read_json
+from replay.sources import BESIDE, ERROR, RECORDING
 from replay.store import FILES, check_free, storage, write_json
 from sensors.errors import EgolocError
 
 KIND = "campaign"
 LOCK = ".lock"
-BESIDE = {"config.toml", "manifest.json", "metrics.json", "segments.parquet", "percentiles.parquet", "report.html"}
-"""What stands in the folder besides those of the logs."""
 LEFTOVER = re.compile(r"\..*\.(tmp|old)")
 """What only a process that died leaves: files and folders are written under such names and renamed."""
 SAME = {
@@ -31,7 +31,7 @@ SAME = {
 
 def error_file(folder: Path, log: str) -> Path:
     """Where the error of a log that failed is written in full."""
-    return folder / f"{log}.error.txt"
+    return folder / f"{log}{ERROR}"
 
 
 def is_campaign(folder: Path) -> bool:
@@ -53,15 +53,9 @@ def campaign_folder(
 
     Raises EgolocError where something else stands there, or a campaign of other logs or settings.
     """
-    there = out.exists() or out.is_symlink()
-    if there and not (resume or overwrite):
-        raise EgolocError(f"{out}: {_what_is_there(out)}")
-    if there and not out.is_dir():
-        raise EgolocError(f"{out}: expected a folder of a campaign")
-    if not there:
-        check_free(out)
+    check_place(out, resume=resume, overwrite=overwrite)
     with storage(out):
-        out.mkdir(parents=True, exist_ok=there)
+        out.mkdir(parents=True, exist_ok=resume or overwrite)
     with _locked(out):
         with storage(out):
             begun = _begun(out, manifest, resume=resume)
@@ -73,7 +67,18 @@ def campaign_folder(
         try:
             yield dict(manifest if begun is None else begun)
         finally:
-            _clear_leftovers(out)
+            with suppress(OSError):  # the folder may be gone
+                _clear_leftovers(out)
+
+
+def check_place(out: Path, *, resume: bool, overwrite: bool) -> None:
+    """Raise EgolocError where nothing can be begun, nor gone on with."""
+    if not (out.exists() or out.is_symlink()):
+        check_free(out)
+    elif not (resume or overwrite):
+        raise EgolocError(f"{out}: {_what_is_there(out)}")
+    elif not out.is_dir():
+        raise EgolocError(f"{out}: expected a folder of a campaign")
 
 
 def _begun(out: Path, manifest: Mapping[str, Any], *, resume: bool) -> dict[str, Any] | None:
@@ -122,7 +127,17 @@ def _difference(key: str, begun: Mapping[str, Any], now: Mapping[str, Any]) -> s
             if new != old_versions.get(name)
         ]
         return f" ({'; '.join(found)})"
+    if key == "keep":
+        return f" ({_kept(begun.get(key))}, got {_kept(now[key])})"
     return ""
+
+
+def _kept(keep: Any) -> str:
+    """What a manifest says of the tables that are written, in the words of the options."""
+    if not isinstance(keep, dict):
+        return json.dumps(keep)
+    hz = keep.get("states_hz")
+    return f"{'all' if hz is None else hz} and {keep.get('decisions')}"
 
 
 def _clear(out: Path) -> None:
@@ -130,7 +145,7 @@ def _clear(out: Path) -> None:
     logs = log_names(out) if is_campaign(out) else []
     known = BESIDE | FILES | {LOCK, *logs, *(error_file(out, log).name for log in logs)}
     found = [path for path in out.iterdir() if not LEFTOVER.fullmatch(path.name)]
-    if any(path.name not in known and path.suffix != ".rrd" for path in found):
+    if any(path.name not in known and path.suffix != RECORDING for path in found):
         raise EgolocError(f"{out}: --overwrite replaces run folders only, and this is none or holds other files")
     for log in logs:
         check_free(out / log, overwrite=True)

@@ -2,9 +2,10 @@
 
 import logging
 import os
+import re
 import socket
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,8 +19,10 @@ from sensors.errors import EgolocError
 if TYPE_CHECKING:
     from ray import ObjectRef
 
-LOCAL = "local"
-"""Instead of an address: a cluster of this machine, for as long as the command runs."""
+LOCAL, AUTO = "local", "auto"
+"""Instead of an address: a cluster of this machine, for as long as the command runs; one that runs here already."""
+ANSWER_S = 5.0
+"""So long may the machine of a cluster take to answer."""
 AHEAD = 2
 """Tasks given out per core, so that none waits for the driver; their results must fit into memory."""
 POLL_S = 1.0
@@ -27,6 +30,9 @@ QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",  # nothing is sent to Ray's makers unasked
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # what it says of lost nodes would go to standard output, amid the results
 }
+
+ATTEMPTS = "RAY_NUM_REDIS_GET_RETRIES"
+"""How often Ray tries to join: it reads this when it is imported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,45 +55,76 @@ class Parcel:
     files: dict[str, bytes] | None = None
 
 
-def run(works: Sequence[Work], job: Job, report: Report, address: str) -> Generator[Outcome, None, None]:
-    """Replay logs on the cluster at an address, or on one of this machine."""
-    ray = _imported()
-    with _connected(ray, address):
-        task = ray.remote(num_cpus=1, max_retries=DEATHS - 1)(_replay)
-        shared, waiting = ray.put((job, Place(str(Path.cwd()), versions()))), list(reversed(works))
-        running: dict[ObjectRef[Any], Work] = {}
-        while waiting or running:
-            room = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1))) - len(running)
-            for _ in range(min(room, len(waiting))):
-                work = waiting.pop()
-                running[task.remote(work.source, shared)] = work
-            done, _ = ray.wait(list(running), num_returns=len(running), timeout=POLL_S)
-            for reference in done or ():
-                yield _received(ray, reference, running.pop(reference))
+@contextmanager
+def joined(address: str) -> Iterator[Any]:
+    """Ray, connected for the block to the cluster at an address or to one of this machine.
+
+    Ray's own messages are kept off the terminal. Raises EgolocError where there is no cluster.
+    """
+    ray = _imported(address)
+    _check_answers(address)
+    options = {"include_dashboard": False} if address == LOCAL else {}
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        why = "none runs on this machine" if address == AUTO else str(error).partition("\n")[0]
+        raise EgolocError(f"--ray {address}: expected a Ray cluster: {why}") from None
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
 
 
-def _imported() -> Any:
+def _imported(address: str) -> Any:
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
     try:
-        import ray
+        with nullcontext() if address == LOCAL else _one_attempt():
+            import ray
     except ImportError:
         raise EgolocError('--ray: expected Ray to be installed: pip install "egoloc[ray]"') from None
     return ray
 
 
 @contextmanager
-def _connected(ray: Any, address: str) -> Iterator[None]:
-    """A connection that lasts for the block; Ray's own messages are kept off the terminal."""
-    options = {"include_dashboard": False} if address == LOCAL else {}
-    try:
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise EgolocError(f"--ray {address}: expected the address of a Ray cluster, or local: {error}") from None
+def _one_attempt() -> Iterator[None]:
+    """Ray imported in the block joins at once or never: where something else listens, an attempt takes 40 s."""
+    given = os.environ.get(ATTEMPTS)
+    os.environ[ATTEMPTS] = given or "1"
     try:
         yield
     finally:
-        ray.shutdown()
+        if given is None:
+            del os.environ[ATTEMPTS]
+
+
+def _check_answers(address: str) -> None:
+    """Raise unless something listens at HOST:PORT, for which Ray itself would wait many minutes."""
+    if address in (LOCAL, AUTO):
+        return
+    if not re.fullmatch(r"[^/\s]+:\d{1,5}", address):
+        raise EgolocError(f"--ray: expected HOST:PORT of a Ray cluster, {AUTO} or {LOCAL}, got {address!r}")
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), ANSWER_S).close()
+    except OSError as error:
+        why = error.strerror or error
+        raise EgolocError(f"--ray {address}: nothing answers there, expected a Ray cluster: {why}") from None
+
+
+def run(works: Sequence[Work], job: Job, report: Report, ray: Any) -> Generator[Outcome, None, None]:
+    """Replay logs on the cluster that has been joined."""
+    task = ray.remote(num_cpus=1, max_retries=DEATHS - 1)(_replay)
+    shared, waiting = ray.put((job, Place(str(Path.cwd()), versions()))), list(reversed(works))
+    running: dict[ObjectRef[Any], Work] = {}
+    while waiting or running:
+        room = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1))) - len(running)
+        for _ in range(min(room, len(waiting))):
+            work = waiting.pop()
+            running[task.remote(work.source, shared)] = work
+        done, _ = ray.wait(list(running), num_returns=len(running), timeout=POLL_S)
+        for reference in done or ():
+            yield _received(ray, reference, running.pop(reference))
 
 
 def _replay(source: LogSource, shared: tuple[Job, Place]) -> Parcel:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from replay._kernels import sum_drawn
-from replay.campaign_folder import is_campaign
+from replay.campaign_folder import is_campaign, log_names
 from replay.run_files import EXPECTED, read_json
 from replay.segments import AXES, METHODS, Segments, tags
 from replay.sums import Counts, read_segments
@@ -26,6 +26,8 @@ Integers = NDArray[np.int64]
 Slice = tuple[str, str]
 """("all", ""), or "scene" or "mode" and a tag."""
 
+SHOWN = 3
+"""Logs that a message names."""
 CONFIDENCE = 0.95
 SUMMED = (
     *("evaluated_ns", "covered_ns", "good_ns"),
@@ -68,6 +70,8 @@ def compare(a: Path, b: Path, resamples: int = 2000, seed: int = 0) -> dict[str,
     """B minus A for every method, figure and slice that both have, over the segments that both evaluated."""
     if resamples < 1:
         raise EgolocError(f"--resamples: expected at least 1, got {resamples}")
+    if seed < 0:
+        raise EgolocError(f"--seed: expected 0 or more, got {seed}")
     (counts, one), (others, two) = (_run(folder) for folder in (a, b))
     _check_comparable(a, counts, b, others)
     pairs = paired(one, two, by_log=_by_log(a, b))
@@ -105,11 +109,32 @@ def _check_comparable(a: Path, one: Counts, b: Path, two: Counts) -> None:
 def _by_log(a: Path, b: Path) -> bool:
     """Whether segments are told apart by their logs: not in two runs of the same log, whatever its file was called."""
     if is_campaign(a) or is_campaign(b):
+        _check_same_logs(a, b)
         return True
     one, two = (_identity(read_json(folder / "manifest.json").get("log")) for folder in (a, b))
     if one != two:
         raise EgolocError(f"{a}, {b}: no common segments: expected two runs of the same log")
     return False
+
+
+def _check_same_logs(a: Path, b: Path) -> None:
+    """Raise where logs of one name are not one log, as drives of a seed on other roads."""
+    one, two = _identities(a), _identities(b)
+    other = [name for name, log in one.items() if name in two and log != two[name]]
+    if other:
+        raise EgolocError(
+            f"{a}, {b}: {len(other)} logs of the same name are not the same log: {', '.join(other[:SHOWN])}"
+            f"{', ...' if len(other) > SHOWN else ''}"
+        )
+
+
+def _identities(folder: Path) -> dict[str, Any]:
+    """What the manifests of a campaign's finished logs, or of a run, say of each log by its name."""
+    if is_campaign(folder):
+        paths = {name: folder / name / "manifest.json" for name in log_names(folder)}
+        return {name: _identity(read_json(path).get("log")) for name, path in paths.items() if path.is_file()}
+    manifest = read_json(folder / "manifest.json")
+    return {manifest["name"]: _identity(manifest.get("log"))} if "name" in manifest else {}
 
 
 def _identity(log: Any) -> Any:

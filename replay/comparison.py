@@ -80,6 +80,8 @@ def _notes(comparison: Mapping[str, Any], differing: Sequence[str]) -> Iterator[
         f"Over the {comparison['pairs']:,} segments of 60 s that both evaluated; only A: {comparison['only_a']:,}, "
         f"only B: {comparison['only_b']:,}, left out."
     )
+    if not differing:
+        return
     yield (
         f"from, to: the middle {100 * comparison['confidence']:g} % of the differences in {comparison['resamples']:,} "
         f"resamples of these pairs (paired bootstrap, seed {comparison['seed']}), where there are {LEAST_PAIRS}; "

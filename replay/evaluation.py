@@ -136,8 +136,8 @@ class Evaluation:
     def _take(self, until_ns: int) -> Batch:
         """The rows up to a time that have not been taken."""
         since, until = self._done_ns, max(until_ns, self._done_ns)
-        states, self._states = _split(States, self._states, until)
-        decisions, self._decisions = _split(Decisions, self._decisions, until)
+        states, self._states = _split(self._states, until)
+        decisions, self._decisions = _split(self._decisions, until)
         batch = Batch(
             self._state_rows(states, since, until),
             self._decision_rows(decisions),
@@ -204,9 +204,9 @@ class Evaluation:
         return {"scene": self._scenes.at(t_ns), "mode": self._modes.at(t_ns)}
 
 
-def _split(kind: type[Record], parts: list[Record], until_ns: int) -> tuple[Record, list[Record]]:
+def _split(parts: list[Record], until_ns: int) -> tuple[Record, list[Record]]:
     """The rows before the first that is later than a time, and the others."""
-    whole = join(kind, parts)
+    whole = join(parts)
     later = whole.t_ns > until_ns
     count = int(np.argmax(later)) if later.any() else len(later)
     return _rows(whole, slice(count)), [_rows(whole, slice(count, None))] if count < len(later) else []

@@ -2,13 +2,15 @@
 Vectorized Maps" (He et al. 2023), Table 5.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 from replay.segments import AXES
-from replay.table import METHOD_NAMES, ar_digits, axis_cells, axis_headers, bare_table, percent
+from replay.table import METHOD_NAMES, PLAIN_WIDTH, ar_digits, axis_cells, axis_headers, bare_table, percent
 
 PAPER_KM = 16_500
 TABLE_5: Mapping[str, Any] = {
@@ -34,20 +36,26 @@ TABLE_5: Mapping[str, Any] = {
 """The paper's rows, in the units of metrics.json."""
 
 
-def paper_table(metrics: Mapping[str, Any]) -> Table:
-    """The paper's row and ours below it, for each method."""
+def paper_table(metrics: Mapping[str, Any], width: int) -> Group:
+    """The paper's row and ours below it, for each method; an axis below the other where that is too wide."""
+    km = metrics["distance_m"] / 1000
+    title = f"EgoVM paper, Table 5 ({PAPER_KM:,} km on roads), and this simulation ({km:,.0f} km)"
+    groups = [AXES] if width >= PLAIN_WIDTH else [(axis,) for axis in AXES]
+    tables = [part for axes in groups for part in ("", _table(metrics, axes))]
+    return Group(Text(title, style="bold"), *tables[1:])
+
+
+def _table(metrics: Mapping[str, Any], axes: Sequence[str]) -> Table:
     table = bare_table(2)
-    table.title = (
-        f"EgoVM paper, Table 5 ({PAPER_KM:,} km on roads), and this simulation ({metrics['distance_m'] / 1000:,.0f} km)"
-    )
-    table.title_justify, table.title_style = "left", "bold"
     for header in ("\nmethod", "\nsource"):
         table.add_column(header, no_wrap=True)
-    for header in ("\nAR", *(header for axis in AXES for header in axis_headers(axis))):
+    with_ar = axes[0] == AXES[0]
+    for header in (*(["\nAR"] if with_ar else []), *(header for axis in axes for header in axis_headers(axis))):
         table.add_column(header, justify="right", no_wrap=True)
     for method, row in TABLE_5.items():
         ours = metrics["methods"].get(method, {"ar": None, **dict.fromkeys(AXES)})
         for name, source, figures in ((METHOD_NAMES[method], "paper", row), ("", "here", ours)):
-            cells = [cell for axis in AXES for cell in axis_cells(figures[axis], 2)]
-            table.add_row(name, source, percent(figures["ar"], 2 if source == "paper" else ar_digits(metrics)), *cells)
+            cells = [cell for axis in axes for cell in axis_cells(figures[axis], 2)]
+            ar = percent(figures["ar"], 2 if source == "paper" else ar_digits(metrics))
+            table.add_row(name, source, *([ar] if with_ar else []), *cells)
     return table

@@ -101,7 +101,7 @@ class Watch:
         if self._aligned:
             return ""
         heading = "a heading (of a pose fix, two antennas or GNSS in motion)"
-        return f"The filter never aligned, there is no output: it needs a second of IMU, a position and {heading}."
+        return f"The filter never aligned, there is no output: it needs IMU, a position and {heading}."
 
     def _diverged(self, start_ns: int) -> str:
         if not self._not_finite:

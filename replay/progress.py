@@ -12,6 +12,9 @@ from replay.sources import LogSource
 if TYPE_CHECKING:
     import rich.progress
 
+BAR_WIDTH = 20
+"""Columns; the kilometres stand beside it, on terminals of 80."""
+
 
 class Progress:
     """Counts what has been replayed since it was entered; shows it where standard error is a terminal."""
@@ -69,6 +72,6 @@ def _bar() -> tuple["rich.progress.Progress", "rich.progress.TaskID"]:
     from rich.progress import Progress as Bar
 
     console = Console(stderr=True)
-    columns = (BarColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
+    columns = (BarColumn(BAR_WIDTH), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
     bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
     return bar, bar.add_task("", total=None, text="")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from replay.batch import End, Job, Work
+from replay.campaign_folder import is_campaign
 from replay.finished import why_not_finished
 from replay.run_files import read_json
 from replay.sources import LogSource
@@ -47,6 +48,8 @@ def resumed(source: LogSource, out: Path, job: Job) -> dict[str, Any] | None:
     clear_leftovers(out)
     if not out.exists():
         return None
+    if is_campaign(out):
+        raise EgolocError(f"{out}: --resume: expected the run of one log, got a campaign: name all of its logs")
     reason = why_not_finished(out, source, job)
     if reason is not None:
         raise EgolocError(f"--resume: {reason}: choose another --out or replace it with --overwrite")
@@ -57,7 +60,7 @@ def _on_cluster(source: LogSource, out: Path, job: Job, address: str, *, overwri
     from replay import cluster
 
     check_free(out, overwrite=overwrite)
-    with closing(cluster.run([Work(source, out)], job, lambda _: None, address)) as ends:
+    with cluster.joined(address) as api, closing(cluster.run([Work(source, out)], job, lambda _: None, api)) as ends:
         outcome = next(ends)
     if outcome.end is End.STORAGE:
         raise StorageError(outcome.error)

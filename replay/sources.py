@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import msgspec
 
 from replay.config import RunConfig
-from sensors.bounds import Positive
 from sensors.errors import EgolocError
 from sensors.records import Log
 
@@ -17,10 +16,16 @@ if TYPE_CHECKING:
     from sensors.simulate.scenarios import Scenario
 
 SCENARIO = "scenario:"
+LONGEST_KM, LONGEST_S = 1e6, 7 * 86_400.0
+"""Of a simulated drive: as far and as long as the simulator goes."""
 LONGEST_NAME = 200
 """Characters: file systems allow 255 for a name with what is added to it."""
-RESERVED = {"config.toml", "manifest.json", "metrics.json", "segments.parquet", "percentiles.parquet"}
-"""What stands beside the folders of the logs."""
+BESIDE = {"config.toml", "manifest.json", "metrics.json", "segments.parquet", "percentiles.parquet", "report.html"}
+"""What stands beside the folders of a campaign's logs."""
+ERROR = ".error.txt"
+"""Ends the name of the file with the error of a log that failed."""
+RECORDING = ".rrd"
+"""Ends the names of recordings, which may stand anywhere."""
 
 
 class LogSource(Protocol):
@@ -82,19 +87,19 @@ class Drives(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How many, with seeds that follow each other."""
     seed: Annotated[int, msgspec.Meta(ge=0)] | None = None
     """Seed of the first."""
-    length_km: Positive | None = None
+    length_km: Annotated[float, msgspec.Meta(gt=0, le=LONGEST_KM)] | None = None
     """Of each, km."""
-    duration_s: Positive | None = None
+    duration_s: Annotated[float, msgspec.Meta(ge=1, le=LONGEST_S)] | None = None
     """Of each, s."""
     network: Annotated[int, msgspec.Meta(ge=0)] | None = None
     """Seed of the roads that they share."""
 
 
 EXPECTED = {
-    "drives": "a number from 1 to 1000000",
+    "drives": "a number from 1 to 1,000,000",
     "seed": "a number from 0 on",
-    "length_km": "kilometres",
-    "duration_s": "seconds",
+    "length_km": f"kilometres, more than 0 and at most {LONGEST_KM:,.0f}",
+    "duration_s": f"seconds, from 1 to a week ({LONGEST_S:,.0f})",
     "network": "a number from 0 on",
 }
 """Keys of Drives, and what messages say of their values."""
@@ -144,6 +149,8 @@ def _drives(text: str) -> Iterator[ScenarioSource]:
 
     name, *options = text.removeprefix(SCENARIO).split(",")
     asked = _options(text, options)
+    if not name:
+        raise EgolocError(f"{text}: expected the name or the TOML file of a scenario after {SCENARIO}")
     scenario = as_long_as(load(name), asked.length_km, asked.duration_s)
     if asked.network is not None:
         if scenario.network is None:
@@ -163,13 +170,15 @@ def as_long_as(scenario: "Scenario", length_km: float | None, duration_s: float 
 
 def _options(text: str, options: list[str]) -> Drives:
     """The KEY=VALUE parts of a scenario reference."""
-    given = {}
+    given: dict[str, str] = {}
     for option in options:
         key, equals, value = option.partition("=")
         if not equals or key not in EXPECTED:
             raise EgolocError(
                 f"{text}: expected {', '.join(f'{key}=' for key in EXPECTED)} after the name, got {option!r}"
             )
+        if key in given:
+            raise EgolocError(f"{text}: {key}: expected one value, got {given[key]!r} and {value!r}")
         given[key] = value
     try:
         return msgspec.convert(given, Drives, strict=False)
@@ -194,7 +203,17 @@ def check_unique(sources: Sequence[LogSource]) -> dict[str, LogSource]:
                 f"expected logs of different names, got {source.name!r} twice: "
                 f"{found[source.name].where} and {source.where}"
             )
-        if source.name in RESERVED or source.name.startswith(".") or len(source.name) > LONGEST_NAME:
+        if not _names_a_folder(source.name):
             raise EgolocError(f"{source.where}: {source.name!r} cannot be the name of a run folder: rename the log")
         found[source.name] = source
     return found
+
+
+def _names_a_folder(name: str) -> bool:
+    """Whether the run folder of a log may be called so, within that of a campaign."""
+    return (
+        0 < len(name) <= LONGEST_NAME
+        and name not in BESIDE
+        and name[0] != "."
+        and not name.endswith((ERROR, RECORDING))
+    )

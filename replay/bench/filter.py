@@ -3,8 +3,8 @@
 One simulated drive: 100 Hz IMU, 10 Hz GNSS positions, 10 Hz pose fixes. egoloc's figures are whole calls of
 ``fusion.run`` (covariances, sorting, alignment, gates, recording included) over all of it. The peers get less to do,
 over its first minutes: arrays ready in one plane before the clock starts, a first state, fixes that share their stamps,
-and no gates or records to keep; filterpy and gtsam also a flat earth. All have 15 states, and tests hold them to the
-truth.
+and no gates or records to keep; filterpy and gtsam also a flat earth. They have 15 states, egoloc one more (the wheel's
+scale); tests hold all of them to the truth.
 """
 
 from collections.abc import Mapping
@@ -52,7 +52,7 @@ def run(repeats: int = 5, seconds: float = 1800.0, peer_steps: Mapping[str, int]
         "imu_hz": 100,
         "gnss_hz": 10,
         "pose_hz": 10,
-        "states": 15,
+        "states": 16,
         "repeats": repeats,
         "peer_steps": {peer: peer_steps[peer] for peer in present},
         "missing": [peer for peer in peer_steps if peer not in present],

@@ -18,8 +18,10 @@ class Score:
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """A run folder; its metrics.json, segments.parquet and percentiles.parquet are replaced."""
-    limits: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Limits on the error: paper, highway or local-street (see replay); default: those of the run's config.toml."""
+    limits: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: those of the run's config.toml)")
+    ] = None
+    """Limits on the error: paper, highway or local-street (see replay)."""
     json: bool = False
     """Print metrics.json instead of the table."""
 
@@ -45,13 +47,13 @@ class Compare:
     """
 
     a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="A")]
-    """A run folder."""
+    """A run folder, or a campaign's."""
     b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")]
     """Another, of the same log or logs and with the same limits."""
     resamples: Annotated[int, tyro.conf.arg(metavar="N")] = 2000
     """Resamples of the pairs, for the intervals."""
-    seed: int = 0
-    """For the resamples."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Seed of the resamples."""
     json: bool = False
     """Print every figure of every method as JSON instead of the table."""
 

@@ -20,13 +20,14 @@ class Demo:
     With --campaign: replay 200 km of the simulated road test, and print its table beside the EgoVM paper's.
     """
 
-    out: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """The run folder, runs/demo or runs/road-test-demo; the log of the ten minutes goes beside it as RUN.mcap. They
-    replace those of an earlier demo."""
+    out: Annotated[
+        Path | None, tyro.conf.arg(metavar="RUN", help_behavior_hint=f"(default: {OUT}, of a campaign {CAMPAIGN_OUT})")
+    ] = None
+    """The run folder; the log goes beside it as RUN.mcap. Those of an earlier demo are replaced."""
     campaign: bool = False
     """Ten drives of 20 km with sensors that fail as real ones do (scenario road-test)."""
-    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Drives replayed at a time (campaign only); default: as many as there are cores."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
+    """Drives replayed at a time (campaign only)."""
     json: bool = False
     """Print metrics.json instead of the table."""
 
@@ -70,6 +71,8 @@ class Demo:
         from replay.sources import parse
         from replay.store import Keep
 
+        if self.workers is not None and self.workers < 1:
+            raise EgolocError(f"--workers: expected 1 or more, got {self.workers}")
         out, sources = self.out or CAMPAIGN_OUT, parse(CAMPAIGN)
         job = Job(RunConfig(), Keep(), command=arguments)
         backend = backend_of(len(sources), self.workers)

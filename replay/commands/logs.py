@@ -13,9 +13,6 @@ from sensors.errors import EgolocError
 if TYPE_CHECKING:  # records bring numpy along
     from sensors.records import Log
 
-LONGEST_KM = 1e6
-"""Of a simulated drive."""
-
 
 @dataclass(frozen=True)
 class Convert:
@@ -27,7 +24,9 @@ class Convert:
     """The file or folder to read."""
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
     """The log to write; it must not exist yet."""
-    reference: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    reference: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: what SRC holds)")] = (
+        None
+    )
     """A trajectory that becomes the log's reference: TUM, CSV with named columns, or Applanix."""
     overwrite: bool = False
     """Replace DEST.mcap."""
@@ -58,11 +57,15 @@ class Simulate:
     """A scenario of the package (demo, clean, road-test) or a TOML file with one."""
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
     """The log to write; it must not exist yet."""
-    seed: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Seed of everything random; default: the scenario's."""
-    duration_s: Annotated[float | None, tyro.conf.arg(metavar="S")] = None
-    """Length of the drive, s; default: the scenario's."""
-    length_km: Annotated[float | None, tyro.conf.arg(metavar="KM")] = None
+    seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: the scenario's)")] = None
+    """Seed of everything random."""
+    duration_s: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="(default: the scenario's)")] = (
+        None
+    )
+    """Length of the drive, s."""
+    length_km: Annotated[float | None, tyro.conf.arg(metavar="KM", help_behavior_hint="(default: the scenario's)")] = (
+        None
+    )
     """Length of the drive, km; with a duration as well, what ends first."""
     overwrite: bool = False
     """Replace DEST.mcap."""
@@ -71,7 +74,7 @@ class Simulate:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Simulate, write, and say what was written."""
-        from replay.sources import as_long_as
+        from replay.sources import LONGEST_KM, as_long_as
         from sensors.simulate.drive import simulate_pieces
         from sensors.simulate.scenarios import load
 
@@ -90,7 +93,7 @@ class Info:
 
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
     """The log."""
-    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml", help_behavior_hint="(default: none)")] = None
     """A config whose [topics] choose between topics."""
     json: bool = False
     """Print JSON."""

@@ -23,10 +23,14 @@ class View:
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """A run folder."""
-    other: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RUN_B")] = None
+    other: Annotated[
+        tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RUN_B", help_behavior_hint="(default: none)")
+    ] = None
     """A second run of the same log, to compare by eye."""
-    rrd: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
-    """Where to write the recording instead."""
+    rrd: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd", help_behavior_hint="(default: in or beside RUN)")] = (
+        None
+    )
+    """Where to write the recording."""
     no_open: bool = False
     """Only write the recording."""
 

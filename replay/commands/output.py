@@ -43,7 +43,8 @@ def show_campaign(campaign: "Campaign", folder: Path, *, as_json: bool, paper: b
             from replay.paper import paper_table
             from replay.table import output_console
 
-            output_console().print("", paper_table(campaign.metrics), sep="\n")
+            console = output_console()
+            console.print("", paper_table(campaign.metrics, console.width), sep="\n")
     sys.stdout.flush()
     failed = campaign.logs["failed"]
     for entry in failed[:SHOWN]:

@@ -23,35 +23,42 @@ class Replay:
 
     Writes a run folder: config.toml, manifest.json, metrics.json and Parquet tables. Of several logs, a run folder each
     and the metrics of all; a log that fails is told at the end, and the exit code is 1.
+
+    Drives that are simulated on the way: scenario:NAME[,drives=N][,seed=S][,length_km=L][,duration_s=T][,network=K].
     """
 
-    logs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="LOG [LOG ...]")]
-    """MCAP logs, or drives that are simulated on the way: scenario:NAME[,drives=N][,seed=S][,length_km=L]
-    [,duration_s=T][,network=K]. One log becomes the run folder RUN, several become RUN/<name of the log> each."""
+    logs: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="LOG [LOG ...]", help_behavior_hint="(required)")
+    ]
+    """MCAP files, or scenario:NAME. One log becomes the run folder RUN, several become RUN/<name of the log> each."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
     """The run folder to write; it must not exist yet."""
-    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
+    config: Annotated[
+        Path | None, tyro.conf.arg(metavar="FILE.toml", help_behavior_hint="(default: none, as if empty)")
+    ] = None
     """TOML with any of [topics], [vehicle], [map_frame], [fusion], [limits], [hide_gnss]; the rest has defaults."""
-    limits: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Largest longitudinal, lateral and yaw error: paper (0.6 m, 0.3 m, 1 deg), highway (1.4 m, 0.57 m, 1.5 deg) or
-    local-street (0.29 m, 0.29 m, 0.5 deg); default: the config's, else paper."""
-    reference: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A trajectory to score against instead of the log's: TUM, CSV with named columns, or Applanix."""
-    hide_gnss: Annotated[str | None, tyro.conf.arg(metavar="EVERY:LENGTH")] = None
-    """Hide GNSS for LENGTH seconds every EVERY seconds and score against the hidden RTK-fixed fixes, as in 60:15.
-    The first stretch starts EVERY seconds after the first fix; one that the log's end cuts off is not used."""
-    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Logs replayed at a time, each in a process of its own; default: as many as there are cores."""
-    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
-    """Replay on a Ray cluster instead: its address, auto, or local for one on this machine. Needs egoloc[ray]."""
+    limits: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the config's, else paper)")
+    ] = None
+    """Largest lon, lat, yaw error: paper 0.6 m, 0.3 m, 1 deg; highway 1.4, 0.57, 1.5; local-street 0.29, 0.29, 0.5."""
+    reference: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: the log's)")] = None
+    """A trajectory to score against: TUM, CSV with named columns, or Applanix."""
+    hide_gnss: Annotated[
+        str | None, tyro.conf.arg(metavar="EVERY:LENGTH", help_behavior_hint="(default: hide nothing)")
+    ] = None
+    """Hide GNSS for LENGTH s every EVERY s, as in 60:15, and score against the RTK-fixed fixes that were hidden."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
+    """Logs replayed at a time, each in a process of its own."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")] = None
+    """Replay on a Ray cluster: its HOST:PORT, auto, or local for one that is started here. Needs egoloc[ray]."""
     resume: bool = False
     """Go on with a replay that was stopped: finished logs stay, the others run. Logs and settings must be the same."""
-    states_hz: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """States written, 1/s (0: none); default: all. All are scored in any case."""
+    states_hz: Annotated[float | None, tyro.conf.arg(metavar="HZ", help_behavior_hint="(default: all)")] = None
+    """States written, 1/s (0: none). All are scored in any case."""
     decisions: Literal["all", "rejected", "none"] = "all"
     """Decisions on measurements written. All are counted in any case."""
     overwrite: bool = False
-    """Replace RUN if it is a run folder."""
+    """Replace RUN if it is a run folder or a campaign's."""
     json: bool = False
     """Print metrics.json instead of the table."""
 

@@ -81,6 +81,29 @@ def test_a_wrong_fix_after_an_outage_is_not_followed(drive: Drive) -> None:
     assert (result.decisions.reason[rows][s > 125.0] == Reason.ACCEPTED).mean() > 0.95
 
 
+def test_reflections_that_upset_position_and_velocity(drive: Drive) -> None:
+    """The velocity alone would pass its gate, and take the state four metres away from right pose fixes."""
+    log = replace(drive.log, wheel=None)
+    assert log.gnss is not None
+    assert log.gnss_velocity is not None
+    begin = moving_at(drive, 5.0)
+    s = seconds(log, log.gnss.t_ns)
+    inside = (s > begin) & (s < begin + 30.0)
+    gnss = off(log.gnss, inside, np.array([2.0, -1.5, 3.0]), GnssStatus.FIXED, 0.02)
+    s = seconds(log, log.gnss_velocity.t_ns)
+    inside = (s > begin) & (s < begin + 30.0)
+    velocity = log.gnss_velocity.vel_enu + np.where(inside[:, None], [0.12, -0.09, 0.045], 0.0)
+    result = run(replace(log, gnss=gnss, gnss_velocity=replace(log.gnss_velocity, vel_enu=velocity)))
+    assert np.abs(fused_errors(result, drive)[:, :2]).max() < 0.2
+    decisions = result.decisions
+    rows = decisions.sensor == Sensor.GNSS_VELOCITY
+    s = seconds(log, decisions.t_ns[rows])
+    inside = (s > begin + 0.1) & (s < begin + 30.0)
+    assert (decisions.reason[rows][inside] == Reason.RECEIVER).mean() > 0.99
+    assert (decisions.reason[rows][~inside] == Reason.RECEIVER).mean() < 0.01
+    assert (decisions.reason[decisions.sensor == Sensor.POSE_FIX] == Reason.CHI_SQUARE).mean() < 0.01
+
+
 def led_astray(drive: Drive) -> tuple[Log, float]:
     """A wheel that reads more and more, up to 0.7 m/s, without GNSS and pose fixes; when they return."""
     begin, length = moving_at(drive, 5.0), 15.0

@@ -1,19 +1,23 @@
 """Campaigns in this process: layout, failures, resuming, refusals."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 
 from replay.campaign_folder import LOCK
 from replay.cli import main
+from replay.sources import BESIDE
 from replay.store import StorageError
 from tests.replay.fleet import CAMPAIGN_FILES, LOG_FILES, content, tiny
 
 DRIVES = 4
+DOCS = Path(__file__).parents[2] / "docs/campaigns.md"
 NAMES = [f"tiny-{seed:06d}" for seed in range(DRIVES)]
 
 
@@ -65,6 +69,16 @@ def test_the_tables_of_all_logs_are_one_dataset(campaign: Path) -> None:
     assert pq.read_table(campaign / "segments.parquet")["log"].unique().to_pylist() == NAMES
 
 
+def test_the_snippet_of_the_docs(campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    shutil.copytree(campaign, "runs/road-test")
+    found: dict[str, Any] = {}
+    exec(re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)[0], found)
+    assert found["rows"].schema.names == ["log", "t_ns", "err_lon"]
+    assert set(found["states"].to_table(columns=["log"])["log"].to_pylist()) == set(NAMES)
+
+
 def test_a_log_alone_gives_the_same_run_folder(campaign: Path, logs: str, tmp_path: Path) -> None:
     alone = f"{logs.partition(',')[0]},seed=2"
     assert main(["replay", alone, "--out", str(tmp_path / "run")]) == 0
@@ -104,7 +118,10 @@ def test_resuming_goes_on_with_the_same_logs_and_settings_only(
     assert f"expected the logs that it was begun with ({DRIVES}, got {DRIVES - 1})" in refused("replay", fewer, *again)
     assert ",seed=0, got scenario:tiny,seed=1)" in refused("replay", f"{logs},seed=1", *again)
     assert "expected the configuration" in refused("replay", logs, *again, "--limits", "highway")
-    assert "expected the --states-hz and --decisions" in refused("replay", logs, *again, "--states-hz", "1")
+    kept = "expected the --states-hz and --decisions that it was begun with (all and all, got 1.0 and all)"
+    assert kept in refused("replay", logs, *again, "--states-hz", "1")
+    one = f"{logs.partition(',')[0]},seed=1"
+    assert "expected the run of one log, got a campaign" in refused("replay", one, *again)
     assert "expected one of them" in refused("replay", logs, *again, "--overwrite")
     assert "exists already: expected --resume, --overwrite" in refused("replay", logs, "--out", campaign)
     assert content(campaign, command=True) == before
@@ -159,6 +176,53 @@ def test_view_wants_one_of_the_logs(campaign: Path, refused: Callable[..., str])
     assert f"as in {campaign / NAMES[0]}; there are {', '.join(NAMES)}" in error
     assert main(["view", str(campaign / NAMES[1]), "--no-open", "--rrd", str(campaign.parent / "one.rrd")]) == 0
     assert (campaign.parent / "one.rrd").stat().st_size > 0
+
+
+@pytest.mark.parametrize("moment", ["merge", "write_json"])
+def test_ctrl_c_while_merging(
+    moment: str,
+    logs: str,
+    campaign: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from replay import campaign as module
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, moment, stop)
+    command = ["replay", logs, "--out", str(tmp_path / "run"), "--workers", "1"]
+    assert main(command) == 130
+    counted, said = capsys.readouterr().err.splitlines()
+    assert counted.startswith("Replayed 4 of 4 logs")
+    assert said == "egoloc: interrupted: the same command with --resume goes on"
+    assert not (tmp_path / "run/metrics.json").exists()
+    monkeypatch.undo()
+    assert main([*command, "--resume"]) == 0
+    assert capsys.readouterr().err == ""  # nothing was replayed
+    assert content(tmp_path / "run") == content(campaign)
+
+
+def test_a_folder_that_is_taken_away_is_told(
+    logs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from replay import campaign as module
+
+    right = module.merge
+
+    def taken(parts: Any) -> Any:
+        whole = right(parts)
+        shutil.rmtree(tmp_path / "run")
+        return whole
+
+    monkeypatch.setattr(module, "merge", taken)
+    out = tmp_path / "run"
+    assert main(["replay", logs, "--out", str(out), "--workers", "1"]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith(f"egoloc: error: {out}: cannot be written: No such file or directory; with that mended, ")
+    assert not out.exists()
 
 
 def test_two_at_once_are_refused(campaign: Path, logs: str, tmp_path: Path, refused: Callable[..., str]) -> None:
@@ -270,14 +334,25 @@ class TestSources:
         assert "expected an MCAP log, got a folder" in refused("replay", tmp_path, *out)
         assert "expected a .toml file or one of the scenarios" in refused("replay", "scenario:moon,drives=2", *out)
         assert "got 'speed=3'" in refused("replay", "scenario:clean,speed=3", *out)
-        assert "drives: expected a number from 1 to" in refused("replay", "scenario:clean,drives=0", *out)
-        assert "length_km: expected kilometres, got 'far'" in refused("replay", "scenario:clean,length_km=far", *out)
+        assert "expected the name or the TOML file of a scenario" in refused("replay", "scenario:,drives=2", *out)
+        for drives in ("0", "-1", "x", "", "1e9"):
+            said = f"drives: expected a number from 1 to 1,000,000, got '{drives}'"
+            assert said in refused("replay", f"scenario:clean,drives={drives}", *out)
+        assert "drives: expected one value, got '2' and '3'" in refused(
+            "replay", "scenario:clean,drives=2,drives=3", *out
+        )
+        for km in ("far", "0", "-1", "nan", "inf", "1e7"):
+            said = f"length_km: expected kilometres, more than 0 and at most 1,000,000, got '{km}'"
+            assert said in refused("replay", f"scenario:clean,length_km={km}", *out)
+        assert "duration_s: expected seconds, from 1 to a week" in refused(
+            "replay", "scenario:clean,duration_s=1e6", *out
+        )
         assert "--workers: expected 1 or more" in refused("replay", "scenario:clean", *out, "--workers", "0")
         assert "--workers and --ray" in refused("replay", "scenario:clean", *out, "--workers", "2", "--ray", "local")
         assert "expected a scenario with a network" in refused("replay", "scenario:clean,network=3", *out)
         twice = refused("replay", "scenario:clean,drives=2", "scenario:clean,duration_s=9,seed=3", *out)
         assert "got 'clean-000003' twice" in twice
-        assert "cannot be the name of a run folder" in refused(
-            "replay", tmp_path / "metrics.json.mcap", tmp_path / "a.mcap", *out
-        )
+        for name in (*BESIDE, LOCK, "a.error.txt", "run.rrd"):
+            said = refused("replay", tmp_path / f"{name}.mcap", tmp_path / "a.mcap", *out)
+            assert f"{name!r} cannot be the name of a run folder" in said
         assert list(tmp_path.iterdir()) == []

@@ -123,6 +123,29 @@ def test_a_killed_campaign_resumes_to_the_same_bytes(
     assert content(tmp_path / "run", command=True) == unbroken
 
 
+KILLED_WHILE_MERGING = """
+import os, signal
+import replay.campaign
+replay.campaign.write_json = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+from replay.cli import main
+main()
+"""
+
+
+def test_killed_while_merging(
+    begin: Begin, command: tuple[str, ...], unbroken: dict[str, bytes], tmp_path: Path
+) -> None:
+    """Before metrics.json is written, when the other files of the campaign are there."""
+    killed = [sys.executable, "-c", KILLED_WHILE_MERGING, *command]
+    assert subprocess.run(killed, cwd=tmp_path, check=False, timeout=PATIENCE_S).returncode == -signal.SIGKILL
+    assert len(done(tmp_path / "run")) == DRIVES
+    assert not (tmp_path / "run/metrics.json").exists()
+    again = begin(*command, "--resume")
+    _, error = again.communicate(timeout=PATIENCE_S)
+    assert (again.returncode, error) == (0, "")  # nothing was replayed
+    assert content(tmp_path / "run", command=True) == unbroken
+
+
 def test_ctrl_c_ends_all_and_leaves_what_is_finished(begin: Begin, command: tuple[str, ...], tmp_path: Path) -> None:
     process = begin(*command)
     wait_until(lambda: len(done(tmp_path / "run")) >= 1)

@@ -85,10 +85,29 @@ def test_a_lost_node_costs_nothing(cluster: Any, logs: str, campaign: dict[str, 
     assert found == content(tmp_path / "here")
 
 
-def test_an_address_without_a_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", "scenario:clean", "--out", str(tmp_path / "run"), "--ray", "nowhere"]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("egoloc: error: --ray nowhere: expected the address of a Ray cluster, or local: ")
+MISTAKES = {
+    "nowhere": "--ray: expected HOST:PORT of a Ray cluster, auto or local, got 'nowhere'",
+    "": "--ray: expected HOST:PORT of a Ray cluster, auto or local, got ''",
+    "ray://127.0.0.1:10001": "--ray: expected HOST:PORT of a Ray cluster, auto or local, got 'ray://127.0.0.1:10001'",
+    "127.0.0.1:1": "--ray 127.0.0.1:1: nothing answers there, expected a Ray cluster: Connection refused",
+}
+
+
+@pytest.mark.parametrize("address", MISTAKES)
+def test_an_address_without_a_cluster_costs_nothing(
+    address: str, logs: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Least of all the campaign that was to be replaced."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/manifest.json").write_text('{"kind": "campaign", "logs": []}')
+    (tmp_path / "run/metrics.json").write_text("{}")
+    before = content(tmp_path / "run", command=True)
+    assert main(["replay", logs, "--out", str(tmp_path / "run"), "--ray", address, "--overwrite"]) == 2
+    assert capsys.readouterr().err == f"egoloc: error: {MISTAKES[address]}\n"
+    assert content(tmp_path / "run", command=True) == before
+    assert main(["replay", f"{logs},seed=1", "--out", str(tmp_path / "new"), "--ray", address]) == 2
+    assert main(["replay", "scenario:clean", "--out", str(tmp_path / "one"), "--ray", address]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_without_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

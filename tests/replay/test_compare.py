@@ -124,6 +124,18 @@ class TestRuns:
         assert row["difference"] == row["low"] == row["high"] == 0
         assert find(compare(a, b, resamples=10), "all", "", "fusion", "lon_mae")["difference"] == 0
 
+    def test_logs_of_one_name_must_be_one_log(self, tmp_path: Path) -> None:
+        logs = {f"drive-{seed}": log(seed) for seed in range(2)}
+        for name, roads in (("a", "1"), ("b", "2")):
+            folder = campaign(tmp_path / name, logs)
+            names = [{"name": log_name} for log_name in logs]
+            (folder / "manifest.json").write_text(json.dumps({"kind": "campaign", "logs": names}))
+            run(folder / "drive-0", logs["drive-0"])
+            run(folder / "drive-1", logs["drive-1"], roads)
+        with pytest.raises(EgolocError, match="1 logs of the same name are not the same log: drive-1"):
+            compare(tmp_path / "a", tmp_path / "b", resamples=10)
+        assert compare(tmp_path / "a", tmp_path / "a", resamples=10)["pairs"] == 24
+
     def test_a_campaign_with_one_of_its_logs(self, tmp_path: Path) -> None:
         a = campaign(tmp_path / "a", {f"drive-{seed}": log(seed) for seed in range(3)})
         found = compare(a, run(tmp_path / "b", log(1, 0.5)), resamples=10)
@@ -152,6 +164,7 @@ class TestMistakes:
         logs = campaign(tmp_path / "logs", {"drive-7": log(7)})
         assert "no common segments" in self.refused(capsys, logs, a)
         assert "--resamples: expected at least 1, got 0" in self.refused(capsys, a, a, "--resamples", 0)
+        assert "--seed: expected 0 or more, got -1" in self.refused(capsys, a, a, "--seed", -1)
 
     def test_hidden_gnss_in_one_of_them(self, tmp_path: Path) -> None:
         hidden = log(1)

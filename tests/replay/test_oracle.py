@@ -8,8 +8,8 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from replay.batch import Job, in_process
-from replay.campaign import run_campaign
+from replay.batch import Job
+from replay.campaign import backend_of, run_campaign
 from replay.config import LIMITS, HideGnss, RunConfig
 from replay.rescoring import rescore
 from replay.sources import parse
@@ -24,9 +24,8 @@ def campaign(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     """Three drives of 1 km, and how much time of a method is evaluated at least, s."""
     run: Path = tmp_path_factory.mktemp(request.param) / "run"
     hide = HideGnss(20.0, 5.0) if request.param == "hidden" else None
-    run_campaign(
-        parse("scenario:road-test,drives=3,length_km=1"), run, Job(RunConfig(hide_gnss=hide), Keep()), in_process
-    )
+    drives = parse("scenario:road-test,drives=3,length_km=1")
+    run_campaign(drives, run, Job(RunConfig(hide_gnss=hide), Keep()), backend_of(len(drives), workers=1))
     return run, LEAST_S[request.param]
 
 

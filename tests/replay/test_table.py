@@ -183,9 +183,9 @@ Fusion&100.00%&0.030&0.040&97.80/99.84/99.96&0.026&0.036&97.90/99.89/100.00&0.12
 
 
 class TestPaper:
-    def printed(self, metrics: dict[str, Any]) -> str:
+    def printed(self, metrics: dict[str, Any], width: int = 132) -> str:
         out = io.StringIO()
-        Console(file=out, width=132, highlight=False).print(paper_table(metrics))
+        Console(file=out, width=width, highlight=False).print(paper_table(metrics, width))
         return out.getvalue()
 
     def test_the_papers_rows(self) -> None:
@@ -197,6 +197,18 @@ class TestPaper:
         for cells, line in zip(found, PAPER_ROWS.strip().splitlines(), strict=True):
             plain = line.replace("&", " ").replace("/", " ").replace("%", "").replace("100.00", "100")
             assert cells == plain.split()[1:]
+
+    @pytest.mark.parametrize("width", [80, 100, 131])
+    def test_nothing_is_cut_off_on_a_narrow_terminal(self, width: int) -> None:
+        metrics = tagged().metrics
+        narrow, wide = self.printed(metrics, width), self.printed(metrics)
+        assert "…" not in narrow
+        assert max(map(len, narrow.splitlines())) <= width
+        below = [line.split("here")[1].split() for line in narrow.splitlines() if " here " in line]
+        beside = [line.split("here")[1].split() for line in wide.splitlines() if " here " in line]
+        assert [
+            [*lon, *lat, *yaw] for lon, lat, yaw in zip(*(below[i : i + 3] for i in (0, 3, 6)), strict=True)
+        ] == beside
 
     def test_ours_stand_below(self) -> None:
         text = self.printed(tagged().metrics)
