@@ -4,7 +4,9 @@ A rejection alone proves nothing: a wrong fix and an alias of the map are as ste
 sensors that say the same place, while neither was accepted in between, outvote the state.
 """
 
-from fusion._linalg import Vector
+import math
+
+from fusion._linalg import Vector, attitude, matvec
 from fusion.events import Parameters
 from fusion.measurements import Pair
 from fusion.state import D_AGREED, D_COUNT, D_TIME, E_WHEEL_SCALE, Core, Floats
@@ -63,7 +65,10 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
         clock[0, D_AGREED] = 0
         return
     age = (now - clock[1 - which, D_TIME]) * 1e-9
-    east, north = east - other[0] - age * other[6], north - other[1] - age * other[7]
+    east_apart, north_apart = _apart_by_yaw(core, par, doubt[1, 2])
+    sign = 1.0 if which == 0 else -1.0
+    east -= other[0] + age * other[6] + sign * east_apart
+    north -= other[1] + age * other[7] + sign * north_apart
     ee, en, nn = mine[3] + other[3], mine[4] + other[4], mine[5] + other[5]
     distance = (nn * east * east - 2.0 * en * east * north + ee * north * north) / (ee * nn - en * en)
     agree = distance <= AGREEING and ee + nn <= VAGUE_VAR
@@ -71,6 +76,15 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     if clock[0, D_AGREED] >= par.outvoted:
         _give_way(core.P, doubt)
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
+
+
+@kernel()
+def _apart_by_yaw(core: Core, par: Parameters, yaw: float) -> Pair:
+    """East and north by which the antenna's innovation exceeds the pose's where the state's yaw is wrong by so much."""
+    a, b = par.gnss_arm, par.pose_arm
+    arm = matvec(attitude(core.nav), (a[0] - b[0], a[1] - b[1], a[2] - b[2]))
+    c, s = math.cos(yaw) - 1.0, math.sin(yaw)
+    return c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]
 
 
 @kernel()

@@ -174,6 +174,21 @@ def test_a_first_fix_that_gnss_goes_on_to_contradict_is_believed(drive: Drive) -
     assert (np.abs(fused_errors(result, drive)) < LIMITS).all()
 
 
+def test_a_start_from_a_long_burst_of_wrong_fixes_is_mended(drive: Drive) -> None:
+    """Believed, since GNSS contradicts it for a second, and outvoted as soon as right fixes come; yaw off by 9.6 deg puts
+    the antenna and the camera a decimetre apart."""
+    log = drive.log
+    assert log.pose_fixes is not None
+    pose = log.pose_fixes.pose.copy()
+    pose[1:15] += [1.0, 1.7, np.radians(9.6)]
+    log = replace(log, pose_fixes=replace(log.pose_fixes, pose=pose))
+    result = run(log)
+    assert result.aligned_ns is not None
+    assert result.aligned_ns < log.pose_fixes.t_ns[15]
+    s, errors = late(drive, FusionConfig(), log, 3.5)
+    assert (np.abs(errors) < LIMITS).all()
+
+
 @pytest.mark.parametrize("seed", [100_001, 100_002])
 def test_the_wheels_scale_is_estimated(seed: int) -> None:
     """To a fifth of a per mille within its sigma, from GNSS and pose fixes while they are there."""
