@@ -6,7 +6,6 @@ are not counted. Peak memory is that of a fresh process that replays the log onc
 over a million epochs.
 """
 
-import resource
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from replay.bench.measure import conditions, row, times
+from replay.bench.memory import peak_mb
 from replay.config import LIMITS, RunConfig
 from replay.harness import replay_source
 from replay.metrics import metrics_of
@@ -110,4 +110,4 @@ def _peak_memory_mb(path: Path, out: Path) -> float:
 
 if __name__ == "__main__":
     _replay(Path(sys.argv[1]), Path(sys.argv[2]))
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    print(peak_mb())

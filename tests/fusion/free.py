@@ -10,7 +10,7 @@ from fusion.config import Alignment, FusionConfig, Gates, GnssModel, ImuNoise, M
 from fusion.events import Events, Measurements, Recorder, new_recorder
 from fusion.navigator import feed, start
 from fusion.result import Sensor
-from fusion.sources import APPLY, sources
+from fusion.sources import APPLY, sources, split
 from fusion.state import ACCEL_BIAS, E_ATTITUDE, E_VELOCITY, ERROR_SIZE, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core
 from fusion.timeline import merge, parameters
 from sensors._kernels import EARTH_RATE, gravity_enu
@@ -115,7 +115,7 @@ def go(
 ) -> tuple[Recorder, Events]:
     """Run the samples after the core's time with the log's measurements and the outputs of config."""
     rest = imu[imu.t_ns > core.clock[0]]
-    found = sources(log or Log(vehicle=vehicle), config)
+    _, found = split(sources(log or Log(vehicle=vehicle), config), int(core.clock[0]))
     timeline = merge(found, int(core.clock[0]) + 1, int(rest.t_ns[-1]), config, vehicle.land_vehicle)
     rec = new_recorder(len(timeline.events.t), len(timeline.events.t))
     feed(core, rest, timeline.events, found.measurements, parameters(vehicle, config), rec)

@@ -175,8 +175,8 @@ def test_a_first_fix_that_gnss_goes_on_to_contradict_is_believed(drive: Drive) -
 
 
 def test_a_start_from_a_long_burst_of_wrong_fixes_is_mended(drive: Drive) -> None:
-    """Believed, since GNSS contradicts it for a second, and outvoted as soon as right fixes come; yaw off by 9.6 deg puts
-    the antenna and the camera a decimetre apart."""
+    """Believed, since GNSS contradicts it for a second, and outvoted as soon as right fixes come; a yaw off by 9.6 deg
+    puts the antenna and the camera a decimetre apart."""
     log = drive.log
     assert log.pose_fixes is not None
     pose = log.pose_fixes.pose.copy()
@@ -185,7 +185,7 @@ def test_a_start_from_a_long_burst_of_wrong_fixes_is_mended(drive: Drive) -> Non
     result = run(log)
     assert result.aligned_ns is not None
     assert result.aligned_ns < log.pose_fixes.t_ns[15]
-    s, errors = late(drive, FusionConfig(), log, 3.5)
+    _, errors = late(drive, FusionConfig(), log, 3.5)
     assert (np.abs(errors) < LIMITS).all()
 
 

@@ -6,9 +6,10 @@ import sys
 import pytest
 
 PROGRAM = """
-import resource, sys
+import sys
 from pathlib import Path
 import msgspec
+from replay.bench.memory import peak_mb
 from replay.config import HideGnss, RunConfig
 from replay.harness import replay_source
 from replay.sources import ScenarioSource
@@ -22,7 +23,7 @@ scenario = msgspec.structs.replace(scenario, duration_s=3600.0 * hours, length_k
 config = RunConfig(hide_gnss=HideGnss(60.0, 15.0) if hide else None)
 metrics = replay_source(ScenarioSource(scenario), out, config)
 assert metrics["span_s"] > 3500.0 * hours
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+print(peak_mb())
 """
 
 

@@ -104,8 +104,9 @@ def test_pieces_of_different_drives_are_refused(tmp_path: Path, log: Log) -> Non
 
 
 ROUND_TRIP = """
-import resource, sys
+import sys
 import numpy as np
+from replay.bench.memory import peak_mb
 from sensors.mcap.io import describe, read_pieces, write_log
 from sensors.records import Imu, Log
 
@@ -120,7 +121,7 @@ write_log(path, pieces(count), "lz4")
 assert sum(len(p.imu) for p in read_pieces(path, length_s=20.0)) == 10_000 * count
 seen = []
 assert describe(path, visit=lambda piece: seen.append(len(piece.imu))).rows == {"imu": 10_000 * count}
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+print(peak_mb())
 """
 
 
