@@ -7,16 +7,17 @@ operations run in the same order.
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion._linalg import Vector, attitude, axpy, blend, matvec
-from fusion.covariance import accumulate, coast, propagate, widen
+from fusion._linalg import Matrix, Vector, attitude, axpy, blend, matvec
+from fusion.blocks import arm_of, lasting, see_arm, see_delay
+from fusion.covariance import accumulate, coast, move_blocks, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
-from fusion.measurements import gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
+from fusion.measurements import Pair, gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
-from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, Core, Floats
+from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, ROW, Core, Floats
 from sensors._kernels import radii
 from sensors.kernel import kernel
 
@@ -34,6 +35,8 @@ Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
 _GAP_STEP_NS = 50_000_000
 """A gap is crossed in steps of at most this."""
+NORMAL_GRAVITY = 9.81
+"""Near enough for the acceleration over a delay, m/s^2."""
 Part = tuple[Interval, float, float, float]
 """Part a..b of an interval (0..1) and its length in seconds."""
 
@@ -172,6 +175,8 @@ def _coast(core: Core, par: Parameters, dt: float) -> None:
     nav[2] += nav[5] * dt
     refresh(nav, core.earth)
     coast(core.P, dt, par.coast_accel, par.coast_rate)
+    if core.P.shape[0] > ROW:
+        move_blocks(nav, core.P, par.noise, dt)
 
 
 @kernel(inline="always")
@@ -230,14 +235,15 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
     clear(H)
     r = attitude(nav)
     if kind == _POSE_FIX:
-        dof: int = _measure_pose(core, par, m, row)
+        dof: int = _measure_pose(core, par, m, row, rate)
         return dof
+    arm = arm_of(nav, par.layout, par.gnss_arm)
     if kind == _GNSS_POSITION:
         _copy(m.gnss_cov, row, R)
-        z = gnss_position(nav, r, H, _triple(m.gnss_llh, row), par.gnss_arm)
+        z = gnss_position(nav, r, H, _triple(m.gnss_llh, row), arm)
     elif kind == _GNSS_VELOCITY:
         _copy(m.vel_cov, row, R)
-        z = gnss_velocity(nav, r, H, _triple(m.vel, row), par.gnss_arm, rate)
+        z = gnss_velocity(nav, r, H, _triple(m.vel, row), arm, rate)
     elif kind == _GNSS_YAW:
         R[0, 0] = m.yaw_var[row]
         z = (wrap(m.yaw[row] - yaw_row(r, H, 0)), 0.0, 0.0)
@@ -245,12 +251,32 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
         R[0, 0] = m.wheel_var[row]
         z = (wheel_speed(nav, r, H, m.wheel[row], par.axle, rate), 0.0, 0.0)
     core.residual[0], core.residual[1], core.residual[2] = z
-    return 3 if kind in (_GNSS_POSITION, _GNSS_VELOCITY) else 1
+    if kind not in (_GNSS_POSITION, _GNSS_VELOCITY):
+        return 1
+    if H.shape[1] > ROW:
+        _see_receiver(core, par, r, kind == _GNSS_VELOCITY, rate)
+    return 3
 
 
 @kernel(inline="always")
-def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int:
-    """Pose fix in vehicle axes; directions that the histogram does not observe are dropped."""
+def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rate: Vector) -> None:
+    """What the blocks add to an antenna's position or velocity."""
+    nav, H, layout = core.nav, core.H, par.layout
+    see_arm(H, layout, r, rate, of_velocity)
+    if layout.gnss_delay >= 0:
+        change: Vector = (nav[3], nav[4], nav[5])
+        if of_velocity:
+            f: Vector = (core.last[0, 3] - nav[13], core.last[0, 4] - nav[14], core.last[0, 5] - nav[15])
+            change = matvec(r, f)
+            change = (change[0], change[1], change[2] - NORMAL_GRAVITY)
+        see_delay(nav, H, core.residual, layout.gnss_delay, change)
+    if layout.gnss_error >= 0 and not of_velocity:
+        lasting(nav, H, core.R, core.residual, core.L, layout.gnss_error, par.gnss_share)
+
+
+@kernel(inline="always")
+def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: Vector) -> int:
+    """Pose fix in vehicle axes; directions that the histogram does not observe are dropped; rate: body, rad/s."""
     R, nav, cov = core.R, core.nav, m.pose_cov
     r = attitude(nav)
     c, s = heading(r)
@@ -267,10 +293,29 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int
     R[2, 2] = cov[row, 2, 2]
     limits = par.pose_limits
     trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
+    _see_matching(core, par, (c, s), r[8] * rate[2])
     if trace <= 1.0:  # then every eigenvalue is
         return 3
+    if par.layout.pose_error >= 0:  # R is the white share only
+        white = np.sqrt(1.0 - par.pose_share)
+        limits = (white * limits[0], white * limits[1], white * limits[2])
     kept: int = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
     return kept
+
+
+@kernel(inline="always")
+def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float) -> None:
+    """What the blocks add to a pose fix (along, left, yaw)."""
+    nav, H, residual, layout = core.nav, core.H, core.residual, par.layout
+    c, s = ahead
+    if layout.pose_delay >= 0:
+        change: Vector = (c * nav[3] + s * nav[4], c * nav[4] - s * nav[3], yaw_rate)
+        see_delay(nav, H, residual, layout.pose_delay, change)
+    if layout.pose_yaw >= 0:
+        H[2, layout.pose_yaw] = 1.0
+        residual[2] -= nav[layout.pose_yaw + 1]
+    if layout.pose_error >= 0:
+        lasting(nav, H, core.R, residual, core.L, layout.pose_error, par.pose_share)
 
 
 @kernel(inline="always")

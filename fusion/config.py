@@ -8,7 +8,14 @@ import msgspec
 from sensors.bounds import NonNegative, Positive, RateHz
 from sensors.errors import EgolocError
 
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=0.95)]
+"""Some of a measurement's noise is white, or the filter would believe in differences without limit."""
+
 _NOT_ZERO = {
+    "lasting_s",
+    "lasting_m",
+    "delay_sigma_s",
+    "mounting_sigma_deg",
     "output_hz",
     "rate_hz",
     "window_s",
@@ -51,6 +58,10 @@ class GnssModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The same for velocity, m/s."""
     inflation: Positive = 4.0
     """Position variance is multiplied by this: RTK errors are correlated in time, -."""
+    lasting_share: Share = 0.0
+    """Share of that variance which lasts (reflections, atmosphere, orbits): a state; 0: all of it is white, -."""
+    lasting_s: Positive = 30.0
+    """Correlation time of that share, s."""
     velocity_inflation: Positive = 1.0
     """Velocity variance is multiplied by this, -."""
     use_velocity: bool = True
@@ -66,6 +77,12 @@ class PoseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Apply pose fixes at all."""
     inflation: Positive = 4.0
     """The fix's covariance is multiplied by this: errors of map and features last over many frames, -."""
+    lasting_share: Share = 0.0
+    """Share of that covariance which is bound to the place (map and features): a state; 0: all is white, -."""
+    lasting_m: Positive = 300.0
+    """Correlation length of that share along the road, m."""
+    yaw_offset_sigma_deg: NonNegative = 0.0
+    """Constant yaw error of pose fixes (camera against body, as calibration leaves it): a state; 0: none, deg."""
     sigma_floor_m: NonNegative = 0.02
     """Smallest sigma along any direction of the plane, m."""
     sigma_floor_yaw_deg: NonNegative = 0.05
@@ -117,6 +134,23 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Random walk of that scale error (tyres warm up, loads change), 1/sqrt(h)."""
 
 
+class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is estimated along with the state, each from its value in [vehicle] on."""
+
+    lever_arm: bool = False
+    """The GNSS lever arm; its sigma is the vehicle's gnss_lever_arm_sigma_m."""
+    mounting: bool = False
+    """Pitch and yaw of the vehicle's axes against the body's, which the non-holonomic constraint needs."""
+    mounting_sigma_deg: Positive = 1.0
+    """Sigma of both before anything is known of them, deg."""
+    gnss_delay: bool = False
+    """By how much GNSS is older than its corrected stamp."""
+    pose_delay: bool = False
+    """The same of pose fixes."""
+    delay_sigma_s: Positive = 0.05
+    """Sigma of both before anything is known of them, s."""
+
+
 class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Chi-square gate on innovations."""
 
@@ -154,6 +188,7 @@ class FusionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gnss: GnssModel = GnssModel()
     pose: PoseModel = PoseModel()
     motion: MotionModel = MotionModel()
+    estimate: Estimate = Estimate()
     gates: Gates = Gates()
     alignment: Alignment = Alignment()
 

@@ -4,15 +4,16 @@ Between two uses of P (a measurement, a recorded state) the transition Phi is ac
 and the attitude, as in preintegration; P' = Phi P Phi' + Q costs one product per use instead of one per IMU sample.
 """
 
+import math
 from typing import NamedTuple
 
 from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
-from fusion.state import A_PG, A_R, A_RR, A_S, A_U, A_VG, ACC_SIZE, E_WHEEL_SCALE, ERROR_SIZE, ROW, Floats
+from fusion.state import A_PG, A_R, A_RR, A_S, A_U, A_VG, ACC_SIZE, E_WHEEL_SCALE, ROW, Floats
 from sensors.kernel import kernel
 
 Scratch = tuple[Floats, Floats, Floats]
-"""phi (9, 16), M (9, 16) and Mt (16, 16) of the core."""
+"""phi (9, 16), M (9, n) and Mt (16, 16) of the core."""
 
 
 class Noise(NamedTuple):
@@ -29,6 +30,14 @@ class Noise(NamedTuple):
     bias_rate: float
     wheel_scale_rate: float
     """Growth of the wheel scale's variance, 1/s."""
+    gnss_error: int = -1
+    """Where the errors of GNSS positions that last stand in the error state (``fusion.layout``)."""
+    gnss_rate: float = 0.0
+    """How fast they are forgotten, 1/s."""
+    pose_error: int = -1
+    """The same of pose fixes."""
+    pose_per_m: float = 0.0
+    """How fast they are forgotten along the road, 1/m."""
 
 
 @kernel()
@@ -82,13 +91,26 @@ def _add_minus_skew(phi: Floats, row: int, x: float, y: float, z: float) -> None
 
 @kernel(fastmath={"contract"})
 def _product(phi: Floats, X: Floats, Y: Floats) -> None:
-    """Y (9, 16) = phi (9, 16) X (16, 16). The sum stands inside: the compiler keeps it in vector registers."""
+    """The first 16 columns of Y = phi (9, 16) X. The sum stands inside: the compiler keeps it in vector registers."""
     for i in range(9):
         for j in range(ROW):
             total = 0.0
             for k in range(15):  # the wheel scale moves nothing
                 total += phi[i, k] * X[k, j]
             Y[i, j] = total
+
+
+@kernel(fastmath={"contract"})
+def _other_columns(phi: Floats, P: Floats, M: Floats) -> None:
+    """The columns of M = phi P from 16 on: how the blocks' correlation with position, velocity and attitude moves."""
+    for i in range(9):
+        for j in range(ROW, P.shape[0]):
+            M[i, j] = 0.0
+        for k in range(15):
+            f = phi[i, k]
+            if f != 0.0:
+                for j in range(ROW, P.shape[0]):
+                    M[i, j] += f * P[k, j]
 
 
 @kernel()
@@ -101,18 +123,23 @@ def propagate(
         return
     phi, M, Mt = scratch
     transition(nav, earth, acc, span, phi)
+    size = P.shape[0]
     _product(phi, P, M)
+    if size > ROW:
+        _other_columns(phi, P, M)
     for k in range(15):
         for i in range(9):
             Mt[k, i] = M[i, k]
     for i in range(9):
-        for j in range(9, ERROR_SIZE):
+        for j in range(9, size):
             P[i, j] = P[j, i] = M[i, j]
     _product(phi, Mt, M)
     for i in range(9):
         for j in range(i + 1):
             P[i, j] = P[j, i] = M[i, j]
     _add_noise(P, acc, noise, span)
+    if size > ROW:
+        move_blocks(nav, P, noise, span)
     elapsed[0] = 0.0
     for i in range(ACC_SIZE):
         for j in range(3):
@@ -147,12 +174,35 @@ def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float) -> None:
 
 
 @kernel()
+def fade(nav: Floats, P: Floats, first: int, keep: float) -> None:
+    """Move three unit Gauss-Markov states on: x' = keep x + sqrt(1 - keep^2) w."""
+    size = P.shape[0]
+    for k in range(first, first + 3):
+        nav[k + 1] *= keep
+        for j in range(size):
+            P[k, j] *= keep
+        for j in range(size):
+            P[j, k] *= keep
+        P[k, k] += 1.0 - keep * keep
+
+
+@kernel()
+def move_blocks(nav: Floats, P: Floats, noise: Noise, span: float) -> None:
+    """What changes in the blocks over span seconds."""
+    if noise.gnss_error >= 0:
+        fade(nav, P, noise.gnss_error, math.exp(-noise.gnss_rate * span))
+    if noise.pose_error >= 0:
+        speed = math.sqrt(nav[3] * nav[3] + nav[4] * nav[4])
+        fade(nav, P, noise.pose_error, math.exp(-noise.pose_per_m * speed * span))
+
+
+@kernel()
 def coast(P: Floats, seconds: float, accel: float, rate: float) -> None:
     """Propagate P over a gap in the IMU at constant velocity, and widen it."""
-    for i in range(ERROR_SIZE):
+    for i in range(P.shape[0]):
         for k in range(3):
             P[k, i] += seconds * P[3 + k, i]
-    for i in range(ERROR_SIZE):
+    for i in range(P.shape[0]):
         for k in range(3):
             P[i, k] += seconds * P[i, 3 + k]
     widen(P, seconds, accel, rate)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fusion._linalg import Vector
 from fusion.covariance import Noise
+from fusion.layout import Layout
 from fusion.state import Floats
 
 MOTION = 100
@@ -19,6 +20,10 @@ class Parameters(NamedTuple):
     """The configuration in SI units, as the kernel reads it."""
 
     noise: Noise
+    layout: Layout
+    gnss_share: float
+    """Of a position's variance, that lasts."""
+    pose_share: float
     increments: bool
     max_gap_ns: int
     bridge_ns: int

@@ -4,18 +4,7 @@ import math
 
 from fusion._linalg import Quaternion, Vector, exp_q, multiply, normalize
 from fusion.mechanization import refresh
-from fusion.state import (
-    E_WHEEL_SCALE,
-    ERROR_SIZE,
-    G_COS,
-    G_HEIGHT,
-    G_MERIDIAN,
-    G_SIN,
-    G_TRANSVERSE,
-    ROW,
-    WHEEL_SCALE,
-    Floats,
-)
+from fusion.state import G_COS, G_HEIGHT, G_MERIDIAN, G_SIN, G_TRANSVERSE, Floats
 from sensors.kernel import kernel
 
 FAR_M = 10.0
@@ -28,7 +17,7 @@ def observed_directions(H: Floats, R: Floats, residual: Floats, limits: Vector, 
 
     Eigenvectors u of D^-1 R D^-1, D = diag(limits) (m, m, rad), with an eigenvalue of at most 1 are observed.
     The rows become u' D^-1 of the old ones, so residuals are in units of the limits and R is diagonal. Where all three
-    are observed nothing changes. eigen (2, 3, 3), rows (3, 16): scratch.
+    are observed nothing changes. eigen (2, 3, 3), rows (3, n): scratch.
     """
     for i in range(3):
         for j in range(3):
@@ -41,8 +30,9 @@ def observed_directions(H: Floats, R: Floats, residual: Floats, limits: Vector, 
     if kept == 3:
         return 3
     z: Vector = (residual[0], residual[1], residual[2])
+    size = H.shape[1]
     for i in range(3):
-        for j in range(ROW):
+        for j in range(size):
             rows[i, j] = H[i, j]
             H[i, j] = 0.0
         for j in range(3):
@@ -56,7 +46,7 @@ def observed_directions(H: Floats, R: Floats, residual: Floats, limits: Vector, 
         for a in range(3):
             t = eigen[1, a, k] / limits[a]
             residual[i] += t * z[a]
-            for j in range(9):
+            for j in range(size):
                 H[i, j] += t * rows[a, j]
         i += 1
     return kept
@@ -93,20 +83,23 @@ def diagonalize(eigen: Floats) -> None:
 
 @kernel(fastmath={"contract"})
 def innovate(P: Floats, H: Floats, W: Floats, dof: int, R: Floats, L: Floats) -> bool:
-    """The first dof rows of W (3, 16) = L^-1 H P with L L' = S = H P H' + R, the lower Cholesky factor.
+    """The first dof rows of W (3, n) = L^-1 H P with L L' = S = H P H' + R, the lower Cholesky factor.
 
     False if S is not positive definite.
     """
+    size = P.shape[0]
     for i in range(dof):
-        for j in range(ROW):
-            total = 0.0
-            for k in range(ERROR_SIZE):
-                total += H[i, k] * P[k, j]
-            W[i, j] = total
+        for j in range(size):
+            W[i, j] = 0.0
+        for k in range(size):
+            h = H[i, k]
+            if h != 0.0:  # a sensor sees few of the states
+                for j in range(size):
+                    W[i, j] += h * P[k, j]
     for i in range(dof):
         for j in range(i + 1):
             total = R[i, j]
-            for k in range(ERROR_SIZE):
+            for k in range(size):
                 total += W[i, k] * H[j, k]
             for k in range(j):
                 total -= L[i, k] * L[j, k]
@@ -118,10 +111,10 @@ def innovate(P: Floats, H: Floats, W: Floats, dof: int, R: Floats, L: Floats) ->
                 return False
     for i in range(dof):
         for k in range(i):
-            for j in range(ROW):
+            for j in range(size):
                 W[i, j] -= L[i, k] * W[k, j]
         inverse = 1.0 / L[i, i]
-        for j in range(ROW):
+        for j in range(size):
             W[i, j] *= inverse
     return True
 
@@ -143,16 +136,17 @@ def whiten(dof: int, residual: Floats, L: Floats) -> float:
 @kernel(fastmath={"contract"})
 def shrink(P: Floats, W: Floats, dof: int) -> None:
     """P -= W' W over the first dof rows of W: one loop for each number of rows."""
-    for i in range(ERROR_SIZE):
+    size = P.shape[0]
+    for i in range(size):
         a, b, c = W[0, i], W[1, i], W[2, i]
         if dof == 1:
-            for j in range(ROW):
+            for j in range(size):
                 P[i, j] -= a * W[0, j]
         elif dof == 2:
-            for j in range(ROW):
+            for j in range(size):
                 P[i, j] -= a * W[0, j] + b * W[1, j]
         else:
-            for j in range(ROW):
+            for j in range(size):
                 P[i, j] -= a * W[0, j] + b * W[1, j] + c * W[2, j]
 
 
@@ -163,10 +157,11 @@ def correct(nav: Floats, earth: Floats, P: Floats, W: Floats, dx: Floats, white:
     Resetting the attitude error turns its axes: P is mapped by G = I + [dtheta]x / 2, the left Jacobian of SO(3) to
     first order (Sola 2017, sec. 6.3 and 7.3, for a global error).
     """
-    for j in range(ROW):
+    size = P.shape[0]
+    for j in range(size):
         dx[j] = white[0] * W[0, j]
     for i in range(1, dof):
-        for j in range(ROW):
+        for j in range(size):
             dx[j] += white[i] * W[i, j]
     shrink(P, W, dof)
     inject(nav, earth, dx)
@@ -175,7 +170,7 @@ def correct(nav: Floats, earth: Floats, P: Floats, W: Floats, dx: Floats, white:
 
 @kernel()
 def inject(nav: Floats, earth: Floats, dx: Floats) -> None:
-    """Add the error dx (16,) to nav (17,): metres to radians at the state's place, attitude on the left."""
+    """Add the error dx (n,) to nav (n + 1,): metres to radians at the state's place, attitude on the left."""
     climb = nav[2] - earth[G_HEIGHT]
     m = earth[G_MERIDIAN] * (1.0 - climb * earth[G_MERIDIAN])
     n = earth[G_TRANSVERSE] * (1.0 - climb * earth[G_TRANSVERSE])
@@ -189,9 +184,8 @@ def inject(nav: Floats, earth: Floats, dx: Floats) -> None:
         earth[G_SIN], earth[G_COS] = earth[G_SIN] + earth[G_COS] * dlat, earth[G_COS] - earth[G_SIN] * dlat
     for i in range(3):
         nav[3 + i] += dx[3 + i]
-        nav[10 + i] += dx[9 + i]
-        nav[13 + i] += dx[12 + i]
-    nav[WHEEL_SCALE] += dx[E_WHEEL_SCALE]
+    for k in range(9, len(dx)):
+        nav[k + 1] += dx[k]
     q: Quaternion = (nav[6], nav[7], nav[8], nav[9])
     turn = exp_q((dx[6], dx[7], dx[8]))
     nav[6], nav[7], nav[8], nav[9] = normalize(multiply(turn, q))
@@ -200,12 +194,13 @@ def inject(nav: Floats, earth: Floats, dx: Floats) -> None:
 @kernel(fastmath={"contract"})
 def reset(P: Floats, half: Vector) -> None:
     """P = G P G' with G = I + [half]x on the attitude block."""
-    for j in range(ROW):
+    size = P.shape[0]
+    for j in range(size):
         a, b, c = P[6, j], P[7, j], P[8, j]
         P[6, j] = a + (half[1] * c - half[2] * b)
         P[7, j] = b + (half[2] * a - half[0] * c)
         P[8, j] = c + (half[0] * b - half[1] * a)
-    for j in range(ERROR_SIZE):
+    for j in range(size):
         a, b, c = P[j, 6], P[j, 7], P[j, 8]
         P[j, 6] = a + (half[1] * c - half[2] * b)
         P[j, 7] = b + (half[2] * a - half[0] * c)

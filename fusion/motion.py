@@ -106,11 +106,18 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     if not par.non_holonomic or speed < par.min_speed:
         return _NON_HOLONOMIC, 0
     velocity = body_velocity(nav, attitude(nav), core.H, par.axle, rate)
+    ahead, left, up = velocity
+    pitch, turn, k = 0.0, 0.0, par.layout.mounting
+    if k >= 0:
+        pitch, turn = nav[k + 1], nav[k + 2]
     for j in range(E_WHEEL_SCALE):  # lateral and vertical rows first
-        core.H[0, j], core.H[1, j], core.H[2, j] = core.H[1, j], core.H[2, j], 0.0
+        h = core.H[0, j]
+        core.H[0, j], core.H[1, j], core.H[2, j] = core.H[1, j] - turn * h, core.H[2, j] + pitch * h, 0.0
+    if k >= 0:
+        core.H[0, k + 1], core.H[1, k] = -ahead, ahead
     extra = (par.per_speed * speed) ** 2
     R[0, 0], R[1, 1] = par.lateral_var + extra, par.vertical_var + extra
-    residual[0], residual[1] = -velocity[1], -velocity[2]
+    residual[0], residual[1] = turn * ahead - left, -pitch * ahead - up
     return _NON_HOLONOMIC, 2
 
 

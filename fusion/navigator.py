@@ -13,11 +13,12 @@ from fusion._kernels import process
 from fusion.alignment import SERVING, Aligner, Initial
 from fusion.config import FusionConfig
 from fusion.events import OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
+from fusion.layout import prior_variances
 from fusion.mechanization import refresh
 from fusion.recording import decisions, join, states, unused
 from fusion.result import Decisions, Reason, States
 from fusion.sources import APPLY, RECORDS, joined, sources, split
-from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, Core, new_core
+from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, ERROR_SIZE, NAV_SIZE, Core, Floats, new_core
 from fusion.timeline import merge, parameters
 from sensors import pieces
 from sensors.clock import NS_PER_S
@@ -40,6 +41,7 @@ class Navigator:
         what alignment itself looks back on: only measurements that come late need more."""
         self._empty = Log(vehicle=vehicle, map_frame=map_frame)
         self._config, self._par = config, parameters(vehicle, config)
+        self._priors = prior_variances(vehicle, config)
         self._aligner = Aligner(vehicle, config, self._par)
         self._kept_ns = round((config.alignment.window_s + kept_s) * NS_PER_S)
         self._rows = dict.fromkeys(RECORDS, 0)
@@ -118,7 +120,7 @@ class Navigator:
         if len(early.t_ns):
             self._decisions.append(unused(early, Reason.BEFORE_ALIGNMENT, initial))
         if initial is not None:
-            self.core, self.aligned_ns = start(initial, imu), initial.t_ns
+            self.core, self.aligned_ns = start(initial, imu, self._priors), initial.t_ns
         return self.core
 
     def _process(self, core: Core, imu: Imu) -> None:
@@ -140,14 +142,19 @@ class Navigator:
             self._decisions.append(decisions(recorder, timeline))
 
 
-def start(initial: Initial, imu: Imu) -> Core:
-    """A core at the first state, with the IMU sample at or before it as the last one."""
-    core = new_core()
+def start(initial: Initial, imu: Imu, priors: Floats | None = None) -> Core:
+    """A core at the first state, with the IMU sample at or before it as the last one.
+
+    priors: (n,) variances of the blocks (``fusion.layout``); without them there are none.
+    """
+    core = new_core(ERROR_SIZE if priors is None else len(priors))
     before = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right")) - 1
     core.clock[C_STATE] = initial.t_ns
     core.clock[C_SAMPLE] = imu.t_ns[before]
     core.clock[C_TICK] = initial.t_ns
-    core.nav[:], core.P[:] = initial.nav, initial.P
+    if priors is not None:
+        np.fill_diagonal(core.P, priors)
+    core.nav[:NAV_SIZE], core.P[:ERROR_SIZE, :ERROR_SIZE] = initial.nav, initial.P
     refresh(core.nav, core.earth)
     core.last[0, :3], core.last[0, 3:] = imu.gyro[before], imu.accel[before]
     if before > 0:

@@ -143,7 +143,8 @@ def _gnss(fixes: GnssFix, vehicle: Vehicle, config: FusionConfig, first_row: int
     low = fixes.status < max(model.min_status, GnssStatus.SINGLE)
     verdict = np.where(low & (verdict == APPLY), np.int8(Reason.STATUS), verdict)
     floors = np.array([model.sigma_floor_horizontal_m] * 2 + [model.sigma_floor_vertical_m]) ** 2
-    cov = _floor(fixes.cov_enu * model.inflation, floors) + np.eye(3) * vehicle.gnss_lever_arm_sigma_m**2
+    arm_var = 0.0 if config.estimate.lever_arm else vehicle.gnss_lever_arm_sigma_m**2
+    cov = _floor(fixes.cov_enu * model.inflation, floors) + np.eye(3) * arm_var
     place = {"gnss_llh": fixes.llh, "gnss_cov": cov}
     positions = _of(Sensor.GNSS_POSITION, fixes, vehicle.gnss_delay_s, place, verdict, first_row)
     known = np.flatnonzero(np.isfinite(fixes.yaw) & np.isfinite(fixes.yaw_sigma))

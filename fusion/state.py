@@ -1,9 +1,10 @@
 """The state, its error and the working memory of the filter.
 
-Nominal state ``nav`` (17,): latitude rad, longitude rad, height m; velocity ENU m/s; q_enu_body xyzw; gyro bias rad/s;
-accelerometer bias m/s^2; scale error of the wheel speed. Error state (16,): position ENU m, velocity ENU m/s, attitude
-rad (left error, ENU: ``R_true = Exp(dtheta) R``), gyro bias, accelerometer bias, wheel scale; each is true minus
-estimate and is added on correction.
+Nominal state ``nav`` (n + 1,): latitude rad, longitude rad, height m; velocity ENU m/s; q_enu_body xyzw; gyro bias
+rad/s; accelerometer bias m/s^2; scale error of the wheel speed; then the blocks of ``fusion.layout``. Error state (n,):
+position ENU m, velocity ENU m/s, attitude rad (left error, ENU: ``R_true = Exp(dtheta) R``), gyro bias, accelerometer
+bias, wheel scale, the blocks; each is true minus estimate and is added on correction. From the gyro bias on, error k
+belongs to nav[k + 1]. n is 16 or more, a multiple of eight: what fills it up has no variance.
 """
 
 from typing import NamedTuple
@@ -29,13 +30,14 @@ E_GYRO_BIAS = slice(9, 12)
 E_ACCEL_BIAS = slice(12, 15)
 E_WHEEL_SCALE = 15
 ERROR_SIZE = 16
+"""States that are always there."""
 
 RING_SIZE = 2048
 """IMU samples kept to see whether the vehicle stands still."""
 
 
 ROW = ERROR_SIZE
-"""Length of the rows of P, H and Phi: they fill vector registers."""
+"""Columns of the transition: nothing but these states moves by the IMU."""
 
 # first rows of what Core.acc holds, each (3,) or (3, 3)
 A_S = 0
@@ -67,14 +69,14 @@ class Core(NamedTuple):
 
     clock (6,) int64: times of the state, the last IMU sample and the last motion tick (ns), samples put into the ring,
     whether the sample before the last serves the bend, the interval before the last sample (ns).
-    nav (17,); P (16, 16); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
+    nav (n + 1,); P (n, n); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
     span (1,): seconds since P was propagated; acc (14, 3): the transition over them (A_*).
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
     doubt (2, 8), doubt_clock (2, 3) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
-    phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
-    eigen (2, 3, 3), residual (3,), dx (16,): scratch.
+    phi (9, 16), M (9, n), Mt (16, 16), H, W (3, n), R, L (3, 3),
+    eigen (2, 3, 3), residual (3,), dx (n,): scratch.
     """
 
     clock: Nanoseconds
@@ -101,12 +103,12 @@ class Core(NamedTuple):
     dx: Floats
 
 
-def new_core() -> Core:
-    """A core of zeros, to be filled by alignment."""
+def new_core(size: int = ERROR_SIZE) -> Core:
+    """A core of zeros with so many error states, to be filled by alignment."""
     return Core(
         clock=np.zeros(6, np.int64),
-        nav=np.zeros(NAV_SIZE),
-        P=np.zeros((ERROR_SIZE, ERROR_SIZE)),
+        nav=np.zeros(size + 1),
+        P=np.zeros((size, size)),
         last=np.zeros((2, 6)),
         span=np.zeros(1),
         acc=np.zeros((ACC_SIZE, 3)),
@@ -117,13 +119,13 @@ def new_core() -> Core:
         doubt=np.zeros((2, 8)),
         doubt_clock=np.zeros((2, 3), np.int64),
         phi=np.zeros((9, ROW)),
-        M=np.zeros((9, ROW)),
+        M=np.zeros((9, size)),
         Mt=np.zeros((ERROR_SIZE, ROW)),
-        H=np.zeros((3, ROW)),
-        W=np.zeros((3, ROW)),
+        H=np.zeros((3, size)),
+        W=np.zeros((3, size)),
         R=np.zeros((3, 3)),
         L=np.zeros((3, 3)),
         eigen=np.zeros((2, 3, 3)),
         residual=np.zeros(3),
-        dx=np.zeros(ROW),
+        dx=np.zeros(size),
     )

@@ -12,6 +12,7 @@ from scipy.special import gammaincinv
 from fusion.config import FusionConfig, check
 from fusion.covariance import Noise
 from fusion.events import MOTION, OUTPUT, Events, Parameters
+from fusion.layout import layout_of
 from fusion.sources import APPLY, Sources
 from sensors.vehicle import ImuSpec, Vehicle
 
@@ -46,9 +47,19 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         first, second, third = (_chi_square(gates.probability, dof) for dof in (1, 2, 3))
     else:
         first = second = third = np.inf
+    layout = layout_of(vehicle, config)
     noise = noise_of(vehicle.imu, config.imu.noise_scale, motion.wheel_scale_walk if motion.wheel else 0.0)
+    noise = noise._replace(
+        gnss_error=layout.gnss_error,
+        gnss_rate=1.0 / config.gnss.lasting_s,
+        pose_error=layout.pose_error,
+        pose_per_m=1.0 / pose.lasting_m,
+    )
     return Parameters(
         noise=noise,
+        layout=layout,
+        gnss_share=config.gnss.lasting_share,
+        pose_share=pose.lasting_share,
         increments=vehicle.imu.samples == "increment",
         max_gap_ns=round(config.imu.max_gap_s * 1e9),
         bridge_ns=round(config.imu.max_bridge_s * 1e9),

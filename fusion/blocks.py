@@ -1,0 +1,69 @@
+"""What the optional error states (``fusion.layout``) add to residuals and Jacobians.
+
+Errors that last: a share c of a measurement's covariance R = L L' is that of sqrt(c) L x, x a first-order Gauss-Markov
+process of unit variance, the rest is white. So x follows the covariance that each fix states; it is correlated in time
+(GNSS: reflections, atmosphere) or along the road (pose fixes: map and features stand still when the vehicle does).
+"""
+
+import math
+
+from fusion._linalg import Matrix, Vector, cross, matvec
+from fusion.layout import Layout
+from fusion.state import Floats
+from sensors.kernel import kernel
+
+
+@kernel()
+def lasting(nav: Floats, H: Floats, R: Floats, residual: Floats, L: Floats, first: int, share: float) -> None:
+    """Let x (3) at first carry a share of R (3, 3), which keeps the rest; L (3, 3): scratch."""
+    root = math.sqrt(share)
+    for i in range(3):
+        for j in range(i + 1):
+            total = R[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                L[i, i] = math.sqrt(max(total, 0.0))
+            else:
+                L[i, j] = total / L[j, j] if L[j, j] > 0.0 else 0.0
+    for i in range(3):
+        for j in range(i + 1):
+            H[i, first + j] = root * L[i, j]
+            residual[i] -= root * L[i, j] * nav[first + j + 1]
+    for i in range(3):
+        for j in range(3):
+            R[i, j] *= 1.0 - share
+
+
+@kernel()
+def arm_of(nav: Floats, layout: Layout, arm: Vector) -> Vector:
+    """The lever arm as it is estimated."""
+    k = layout.gnss_arm
+    if k < 0:
+        return arm
+    return arm[0] + nav[k + 1], arm[1] + nav[k + 2], arm[2] + nav[k + 3]
+
+
+@kernel()
+def see_arm(H: Floats, layout: Layout, r: Matrix, rate: Vector, of_velocity: bool) -> None:
+    """Jacobian of an antenna's position, R, or velocity, R [omega]x, against the lever arm."""
+    k = layout.gnss_arm
+    if k < 0:
+        return
+    for j in range(3):
+        unit: Vector = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+        if of_velocity:
+            unit = cross(rate, unit)
+        column = matvec(r, unit)
+        for i in range(3):
+            H[i, k + j] = column[i]
+
+
+@kernel()
+def see_delay(nav: Floats, H: Floats, residual: Floats, k: int, change: Vector) -> None:
+    """A measurement that is older than thought by the delay state k: it shows change (3,), per second, less of it."""
+    if k < 0:
+        return
+    for i in range(3):
+        H[i, k] = -change[i]
+        residual[i] += change[i] * nav[k + 1]
