@@ -248,7 +248,9 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
         R[0, 0] = m.yaw_var[row]
         z = (wrap(m.yaw[row] - yaw_row(r, H, 0)), 0.0, 0.0)
     else:
-        R[0, 0] = m.wheel_var[row]
+        push = core.last[0, 3] - nav[13] - NORMAL_GRAVITY * r[6]
+        slip = par.wheel_slip * push * m.wheel[row]
+        R[0, 0] = m.wheel_var[row] + slip * slip
         z = (wheel_speed(nav, r, H, m.wheel[row], par.axle, rate), 0.0, 0.0)
     core.residual[0], core.residual[1], core.residual[2] = z
     if kind not in (_GNSS_POSITION, _GNSS_VELOCITY):

@@ -128,6 +128,10 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Turn rate at rest, besides the gyro's noise, deg/s."""
     wheel: bool = True
     """Apply wheel speeds."""
+    wheel_inflation: Positive = 1.0
+    """The variance of wheel speeds is multiplied by this: their errors last over many of them, -."""
+    wheel_slip: NonNegative = 0.0
+    """Slip of the wheels (one sigma, lasting errors included) for every m/s^2 of acceleration or braking, s^2/m."""
     wheel_scale_sigma: NonNegative = 0.01
     """Scale error of the wheel speed before anything is known of it (tyre radius); it is estimated, -."""
     wheel_scale_walk: NonNegative = 0.001

@@ -40,6 +40,8 @@ class Parameters(NamedTuple):
     """Largest observed sigma along, left and in yaw."""
     zero_velocity: bool
     non_holonomic: bool
+    wheel_slip: float
+    """Slip for every m/s^2 of acceleration, s^2/m."""
     lateral_var: float
     vertical_var: float
     per_speed: float

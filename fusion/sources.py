@@ -111,7 +111,7 @@ def sources(log: Log, config: FusionConfig, first_rows: Mapping[str, int] | None
             )
         parts.append(_poses(log.pose_fixes, log.map_frame, config, first["pose_fixes"]))
     if log.wheel is not None:
-        columns = {"wheel": log.wheel.speed, "wheel_var": log.wheel.sigma**2}
+        columns = {"wheel": log.wheel.speed, "wheel_var": log.wheel.sigma**2 * config.motion.wheel_inflation}
         verdict = _switch(config.motion.wheel, len(log.wheel))
         parts.append(_of(Sensor.WHEEL, log.wheel, 0.0, columns, verdict, first["wheel"]))
     return joined(parts)

@@ -77,6 +77,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         ),
         zero_velocity=motion.zero_velocity and vehicle.land_vehicle,
         non_holonomic=motion.non_holonomic and vehicle.land_vehicle,
+        wheel_slip=motion.wheel_slip,
         lateral_var=motion.lateral_sigma**2,
         vertical_var=motion.vertical_sigma**2,
         per_speed=motion.sigma_per_speed,
