@@ -80,7 +80,7 @@ def process(
                     _coast(core, par, (stop - now) * 1e-9)
                 else:
                     part = (interval, (now - start) / whole, (stop - start) / whole, (stop - now) * 1e-9)
-                    _advance(nav, earth, acc, span, part)
+                    _advance(nav, earth, acc, span, part, par.layout.gyro_scale)
                     if gap:
                         propagate(nav, earth, core.P, acc, span, (core.phi, core.M, core.Mt), par.noise)
                         widen(core.P, (stop - now) * 1e-9, par.coast_accel, par.coast_rate)
@@ -129,8 +129,8 @@ def _bend(older: Vector, last: Vector, new: Vector) -> Vector:
 
 
 @kernel(inline="always")
-def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part) -> None:
-    """One strapdown step over a part of an IMU interval."""
+def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part, gyro_scale: int) -> None:
+    """One strapdown step over a part of an IMU interval; gyro_scale: its error state."""
     interval, a, b, dt = part
     w0, w1, f0, f1, w_bend, f_bend = interval
     bg: Vector = (nav[10], nav[11], nav[12])
@@ -146,8 +146,11 @@ def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part) 
     bow = ((a * a + a * b + b * b) / 3.0 - 0.5 * (a + b)) * dt
     r = attitude(nav)
     dv = matvec(r, axpy(bow, f_bend, push))
-    accumulate(acc, span, r, dv, dt)
-    strapdown(nav, earth, axpy(bow, w_bend, turn), dv, dt)
+    turn = axpy(bow, w_bend, turn)
+    if gyro_scale >= 0:
+        turn = (turn[0], turn[1], turn[2] * (1.0 - nav[gyro_scale + 1]))
+    accumulate(acc, span, r, dv, turn[2], dt)
+    strapdown(nav, earth, turn, dv, dt)
 
 
 @kernel(inline="always")

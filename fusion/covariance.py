@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
-from fusion.state import A_PG, A_R, A_RR, A_S, A_U, A_VG, ACC_SIZE, E_WHEEL_SCALE, ROW, Floats
+from fusion.state import A_PG, A_R, A_RR, A_S, A_T, A_U, A_VG, ACC_SIZE, E_WHEEL_SCALE, ROW, Floats
 from sensors.kernel import kernel
 
 Scratch = tuple[Floats, Floats, Floats]
@@ -30,8 +30,10 @@ class Noise(NamedTuple):
     bias_rate: float
     wheel_scale_rate: float
     """Growth of the wheel scale's variance, 1/s."""
+    gyro_scale: int = -1
+    """Where the gyro's scale stands in the error state (``fusion.layout``)."""
     gnss_error: int = -1
-    """Where the errors of GNSS positions that last stand in the error state (``fusion.layout``)."""
+    """Where the errors of GNSS positions that last stand."""
     gnss_rate: float = 0.0
     """How fast they are forgotten, 1/s."""
     pose_error: int = -1
@@ -41,11 +43,15 @@ class Noise(NamedTuple):
 
 
 @kernel()
-def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, dt: float) -> None:
+def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, turned: float, dt: float) -> None:
     """Add one IMU step to the transition: r is R_enu_body at its start, dv its velocity increment (m/s, ENU).
 
-    dtheta' = -R dbg, dv' = -[f]x dtheta - R dba, dp' = dv, each constant over the step.
+    dtheta' = -R dbg, dv' = -[f]x dtheta - R dba, dp' = dv, each constant over the step. turned: about the body's
+    vertical axis, rad.
     """
+    acc[A_T, 0] += r[2] * turned
+    acc[A_T, 1] += r[5] * turned
+    acc[A_T, 2] += r[8] * turned
     for j in range(3):
         a0, a1, a2 = r[j] * dt, r[3 + j] * dt, r[6 + j] * dt
         # attitude error in mid-step per gyro bias is -m; velocity changes by dv x m
@@ -125,8 +131,13 @@ def propagate(
     transition(nav, earth, acc, span, phi)
     size = P.shape[0]
     _product(phi, P, M)
+    g = noise.gyro_scale
     if size > ROW:
         _other_columns(phi, P, M)
+    if g >= 0:  # what it does to velocity within the span is left out: the attitude brings it over the next ones
+        for i in range(3):
+            for j in range(size):
+                M[6 + i, j] -= acc[A_T, i] * P[g, j]
     for k in range(15):
         for i in range(9):
             Mt[k, i] = M[i, k]
@@ -134,6 +145,10 @@ def propagate(
         for j in range(9, size):
             P[i, j] = P[j, i] = M[i, j]
     _product(phi, Mt, M)
+    if g >= 0:
+        for i in range(9):
+            for j in range(3):
+                M[6 + j, i] -= acc[A_T, j] * M[i, g]
     for i in range(9):
         for j in range(i + 1):
             P[i, j] = P[j, i] = M[i, j]

@@ -20,13 +20,15 @@ class Layout(NamedTuple):
     gnss_error (3): of the position's error that lasts, ENU, in its own sigmas; pose_error (3): the same of pose fixes,
     along, left and yaw; pose_yaw (1): constant yaw error of pose fixes, rad; gnss_arm (3): of the lever arm, body m;
     mounting (2): pitch and yaw of the vehicle's axes against the body's, rad; gnss_delay, pose_delay (1): by which a
-    measurement is older than its corrected stamp, s.
+    measurement is older than its corrected stamp, s; gyro_scale (1): scale error of the gyro about the vertical axis, -
+    (a car hardly turns about the others).
     """
 
     size: int = ERROR_SIZE
     gnss_error: int = OFF
     pose_error: int = OFF
     pose_yaw: int = OFF
+    gyro_scale: int = OFF
     gnss_arm: int = OFF
     mounting: int = OFF
     gnss_delay: int = OFF
@@ -65,6 +67,7 @@ def _priors(vehicle: Vehicle, config: FusionConfig) -> dict[str, float]:
         "gnss_error": float(gnss.use and gnss.lasting_share > 0.0),
         "pose_error": float(pose.use and pose.lasting_share > 0.0),
         "pose_yaw": math.radians(pose.yaw_offset_sigma_deg) if pose.use else 0.0,
+        "gyro_scale": 1e-6 * vehicle.imu.gyro_scale_ppm,
         "gnss_arm": vehicle.gnss_lever_arm_sigma_m if gnss.use and estimate.lever_arm else 0.0,
         "mounting": math.radians(estimate.mounting_sigma_deg) if estimate.mounting and vehicle.land_vehicle else 0.0,
         "gnss_delay": estimate.delay_sigma_s if gnss.use and estimate.gnss_delay else 0.0,

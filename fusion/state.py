@@ -52,7 +52,9 @@ A_VG = 8
 """Velocity against gyro bias."""
 A_PG = 11
 """Position against gyro bias."""
-ACC_SIZE = 14
+A_T = 14
+"""Integral of the third column of R_enu_body times the body's yaw rate, rad."""
+ACC_SIZE = 15
 
 # entries of Core.earth
 G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8)
@@ -70,7 +72,7 @@ class Core(NamedTuple):
     clock (6,) int64: times of the state, the last IMU sample and the last motion tick (ns), samples put into the ring,
     whether the sample before the last serves the bend, the interval before the last sample (ns).
     nav (n + 1,); P (n, n); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
-    span (1,): seconds since P was propagated; acc (14, 3): the transition over them (A_*).
+    span (1,): seconds since P was propagated; acc (15, 3): the transition over them (A_*).
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.

@@ -50,6 +50,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
     layout = layout_of(vehicle, config)
     noise = noise_of(vehicle.imu, config.imu.noise_scale, motion.wheel_scale_walk if motion.wheel else 0.0)
     noise = noise._replace(
+        gyro_scale=layout.gyro_scale,
         gnss_error=layout.gnss_error,
         gnss_rate=1.0 / config.gnss.lasting_s,
         pose_error=layout.pose_error,

@@ -46,7 +46,7 @@ PresetName = Literal["tactical", "tactical-fog-class", "automotive", "consumer"]
 
 PRESETS: dict[PresetName, ImuPreset] = {
     "tactical": ImuPreset(
-        ImuSpec(),
+        ImuSpec(gyro_scale_ppm=1000.0),
         ImuFlaws(
             gyro_scale_ppm=1000.0,
             accel_scale_ppm=500.0,
@@ -68,6 +68,7 @@ PRESETS: dict[PresetName, ImuPreset] = {
             accel_bias_instability_mg=0.025,
             gyro_turn_on_bias_deg_per_h=7.0,
             accel_turn_on_bias_mg=1.7,
+            gyro_scale_ppm=300.0,
         ),
         ImuFlaws(
             gyro_scale_ppm=300.0,
@@ -90,6 +91,7 @@ PRESETS: dict[PresetName, ImuPreset] = {
             accel_bias_instability_mg=0.04,
             gyro_turn_on_bias_deg_per_h=1200.0,
             accel_turn_on_bias_mg=10.0,
+            gyro_scale_ppm=3000.0,
         ),
         ImuFlaws(
             gyro_scale_ppm=3000.0,
@@ -112,6 +114,7 @@ PRESETS: dict[PresetName, ImuPreset] = {
             accel_bias_instability_mg=0.1,
             gyro_turn_on_bias_deg_per_h=1800.0,
             accel_turn_on_bias_mg=20.0,
+            gyro_scale_ppm=4000.0,
         ),
         ImuFlaws(
             gyro_scale_ppm=4000.0,
