@@ -4,12 +4,14 @@
 operations run in the same order.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion._linalg import Matrix, Vector, attitude, axpy, blend, matvec
-from fusion.blocks import arm_of, lasting, see_arm, see_delay
-from fusion.covariance import accumulate, coast, move_blocks, propagate, widen
+from fusion.blocks import arm_of, fade, lasting, renew, see_arm, see_delay
+from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
 from fusion.measurements import Pair, gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
@@ -82,6 +84,7 @@ def process(
                     part = (interval, (now - start) / whole, (stop - start) / whole, (stop - now) * 1e-9)
                     _advance(nav, earth, acc, span, part, par.layout.gyro_scale)
                     if gap:
+                        _age(core, span[0])
                         propagate(nav, earth, core.P, acc, span, (core.phi, core.M, core.Mt), par.noise)
                         widen(core.P, (stop - now) * 1e-9, par.coast_accel, par.coast_rate)
                 clock[C_STATE] = stop
@@ -154,6 +157,13 @@ def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part, 
 
 
 @kernel(inline="always")
+def _age(core: Core, dt: float) -> None:
+    """Time and road go by for the errors that last."""
+    core.aged[0] += dt
+    core.aged[1] += dt * math.sqrt(core.nav[3] * core.nav[3] + core.nav[4] * core.nav[4])
+
+
+@kernel(inline="always")
 def _remember(core: Core, t: int, w: Vector, f: Vector) -> None:
     """Keep a sample as the last one and in the ring."""
     core.clock[C_INTERVAL] = t - core.clock[C_SAMPLE]
@@ -178,8 +188,7 @@ def _coast(core: Core, par: Parameters, dt: float) -> None:
     nav[2] += nav[5] * dt
     refresh(nav, core.earth)
     coast(core.P, dt, par.coast_accel, par.coast_rate)
-    if core.P.shape[0] > ROW:
-        move_blocks(nav, core.P, par.noise, dt)
+    _age(core, dt)
 
 
 @kernel(inline="always")
@@ -189,6 +198,8 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
     if ev.verdict[e] >= 0:
         _record(rec, e, kind, 0, ev.verdict[e])
         return
+    if core.P.shape[0] > ROW:
+        _age(core, core.span[0])
     propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
     if kind == OUTPUT:
         _record_state(core, rec, ev.t[e])
@@ -276,6 +287,12 @@ def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rat
             change = (change[0], change[1], change[2] - NORMAL_GRAVITY)
         see_delay(nav, H, core.residual, layout.gnss_delay, change)
     if layout.gnss_error >= 0 and not of_velocity:
+        stated = core.R[0, 0] + core.R[1, 1]
+        if 0.25 * core.aged[2] <= stated <= 4.0 * core.aged[2]:
+            fade(nav, core.P, layout.gnss_error, math.exp(-par.gnss_rate * core.aged[0]))
+        else:  # another kind of solution, with errors of its own
+            renew(nav, core.P, layout.gnss_error)
+        core.aged[0], core.aged[2] = 0.0, stated
         lasting(nav, H, core.R, core.residual, core.L, layout.gnss_error, par.gnss_share)
 
 
@@ -320,6 +337,8 @@ def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float) -> 
         H[2, layout.pose_yaw] = 1.0
         residual[2] -= nav[layout.pose_yaw + 1]
     if layout.pose_error >= 0:
+        fade(nav, core.P, layout.pose_error, math.exp(-par.pose_per_m * core.aged[1]))
+        core.aged[1] = 0.0
         lasting(nav, H, core.R, residual, core.L, layout.pose_error, par.pose_share)
 
 

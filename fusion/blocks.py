@@ -13,6 +13,30 @@ from fusion.state import Floats
 from sensors.kernel import kernel
 
 
+@kernel(fastmath={"contract"})
+def fade(nav: Floats, P: Floats, first: int, keep: float) -> None:
+    """Move three unit Gauss-Markov states on: x' = keep x + sqrt(1 - keep^2) w.
+
+    As nothing but its own sensor sees x, this may wait until that measures: the order does not change the result.
+    """
+    for k in range(first, first + 3):
+        nav[k + 1] *= keep
+        for j in range(P.shape[0]):
+            P[k, j] *= keep
+            P[j, k] *= keep
+        P[k, k] += 1.0 - keep * keep
+
+
+@kernel()
+def renew(nav: Floats, P: Floats, first: int) -> None:
+    """Three unit Gauss-Markov states of which nothing is known any more."""
+    for k in range(first, first + 3):
+        nav[k + 1] = 0.0
+        for j in range(P.shape[0]):
+            P[k, j] = P[j, k] = 0.0
+        P[k, k] = 1.0
+
+
 @kernel()
 def lasting(nav: Floats, H: Floats, R: Floats, residual: Floats, L: Floats, first: int, share: float) -> None:
     """Let x (3) at first carry a share of R (3, 3), which keeps the rest; L (3, 3): scratch."""

@@ -56,9 +56,9 @@ class GnssModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The same, vertical, m."""
     sigma_floor_velocity: NonNegative = 0.03
     """The same for velocity, m/s."""
-    inflation: Positive = 4.0
-    """Position variance is multiplied by this: RTK errors are correlated in time, -."""
-    lasting_share: Share = 0.0
+    inflation: Positive = 1.0
+    """Position variance is multiplied by this, -."""
+    lasting_share: Share = 0.7
     """Share of that variance which lasts (reflections, atmosphere, orbits): a state; 0: all of it is white, -."""
     lasting_s: Positive = 30.0
     """Correlation time of that share, s."""
@@ -75,24 +75,25 @@ class PoseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     use: bool = True
     """Apply pose fixes at all."""
-    inflation: Positive = 4.0
-    """The fix's covariance is multiplied by this: errors of map and features last over many frames, -."""
-    lasting_share: Share = 0.0
+    inflation: Positive = 1.0
+    """The fix's covariance is multiplied by this, -."""
+    lasting_share: Share = 0.7
     """Share of that covariance which is bound to the place (map and features): a state; 0: all is white, -."""
     lasting_m: Positive = 300.0
     """Correlation length of that share along the road, m."""
-    yaw_offset_sigma_deg: NonNegative = 0.0
+    yaw_offset_sigma_deg: NonNegative = 0.1
     """Constant yaw error of pose fixes (camera against body, as calibration leaves it): a state; 0: none, deg."""
     sigma_floor_m: NonNegative = 0.02
     """Smallest sigma along any direction of the plane, m."""
     sigma_floor_yaw_deg: NonNegative = 0.05
     """Smallest sigma of yaw, deg."""
-    max_sigma_longitudinal_m: Positive = 0.47
-    """Covariance gate: a direction with more than this (inflated) is not observed by the histogram, and dropped, m."""
-    max_sigma_lateral_m: Positive = 0.47
+    max_sigma_longitudinal_m: Positive = 0.33
+    """Covariance gate: a direction with more than this is not observed by the histogram (half the variance of a flat
+    window at the finest level), and dropped, m."""
+    max_sigma_lateral_m: Positive = 0.33
     """The same, lateral, m."""
-    max_sigma_yaw_deg: Positive = 0.66
-    """The same, yaw (half a flat window's variance): at rest there is no other yaw to start with, deg."""
+    max_sigma_yaw_deg: Positive = 0.33
+    """The same, yaw, deg."""
 
 
 class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -130,11 +131,11 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Apply wheel speeds."""
     wheel_inflation: Positive = 1.0
     """The variance of wheel speeds is multiplied by this: their errors last over many of them, -."""
-    wheel_slip: NonNegative = 0.0
+    wheel_slip: NonNegative = 0.05
     """Slip of the wheels (one sigma, lasting errors included) for every m/s^2 of acceleration or braking, s^2/m."""
     wheel_scale_sigma: NonNegative = 0.01
     """Scale error of the wheel speed before anything is known of it (tyre radius); it is estimated, -."""
-    wheel_scale_walk: NonNegative = 0.001
+    wheel_scale_walk: NonNegative = 0.003
     """Random walk of that scale error (tyres warm up, loads change), 1/sqrt(h)."""
 
 

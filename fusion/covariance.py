@@ -4,12 +4,11 @@ Between two uses of P (a measurement, a recorded state) the transition Phi is ac
 and the attitude, as in preintegration; P' = Phi P Phi' + Q costs one product per use instead of one per IMU sample.
 """
 
-import math
 from typing import NamedTuple
 
 from fusion._linalg import Matrix, Vector, cross
 from fusion.mechanization import slow_dynamics
-from fusion.state import A_PG, A_R, A_RR, A_S, A_T, A_U, A_VG, ACC_SIZE, E_WHEEL_SCALE, ROW, Floats
+from fusion.state import A_PG, A_R, A_RR, A_S, A_T, A_U, A_VG, ACC_SIZE, E_WHEEL_SCALE, LANE, ROW, Floats
 from sensors.kernel import kernel
 
 Scratch = tuple[Floats, Floats, Floats]
@@ -32,14 +31,6 @@ class Noise(NamedTuple):
     """Growth of the wheel scale's variance, 1/s."""
     gyro_scale: int = -1
     """Where the gyro's scale stands in the error state (``fusion.layout``)."""
-    gnss_error: int = -1
-    """Where the errors of GNSS positions that last stand."""
-    gnss_rate: float = 0.0
-    """How fast they are forgotten, 1/s."""
-    pose_error: int = -1
-    """The same of pose fixes."""
-    pose_per_m: float = 0.0
-    """How fast they are forgotten along the road, 1/m."""
 
 
 @kernel()
@@ -109,14 +100,13 @@ def _product(phi: Floats, X: Floats, Y: Floats) -> None:
 @kernel(fastmath={"contract"})
 def _other_columns(phi: Floats, P: Floats, M: Floats) -> None:
     """The columns of M = phi P from 16 on: how the blocks' correlation with position, velocity and attitude moves."""
-    for i in range(9):
-        for j in range(ROW, P.shape[0]):
-            M[i, j] = 0.0
-        for k in range(15):
-            f = phi[i, k]
-            if f != 0.0:
-                for j in range(ROW, P.shape[0]):
-                    M[i, j] += f * P[k, j]
+    for first in range(ROW, P.shape[0], LANE):
+        for i in range(9):
+            for j in range(LANE):
+                total = 0.0
+                for k in range(15):
+                    total += phi[i, k] * P[k, first + j]
+                M[i, first + j] = total
 
 
 @kernel()
@@ -153,8 +143,6 @@ def propagate(
         for j in range(i + 1):
             P[i, j] = P[j, i] = M[i, j]
     _add_noise(P, acc, noise, span)
-    if size > ROW:
-        move_blocks(nav, P, noise, span)
     elapsed[0] = 0.0
     for i in range(ACC_SIZE):
         for j in range(3):
@@ -186,29 +174,6 @@ def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float) -> None:
     for i in range(3, 6):
         for j in range(6, 9):
             P[j, i] = P[i, j]
-
-
-@kernel()
-def fade(nav: Floats, P: Floats, first: int, keep: float) -> None:
-    """Move three unit Gauss-Markov states on: x' = keep x + sqrt(1 - keep^2) w."""
-    size = P.shape[0]
-    for k in range(first, first + 3):
-        nav[k + 1] *= keep
-        for j in range(size):
-            P[k, j] *= keep
-        for j in range(size):
-            P[j, k] *= keep
-        P[k, k] += 1.0 - keep * keep
-
-
-@kernel()
-def move_blocks(nav: Floats, P: Floats, noise: Noise, span: float) -> None:
-    """What changes in the blocks over span seconds."""
-    if noise.gnss_error >= 0:
-        fade(nav, P, noise.gnss_error, math.exp(-noise.gnss_rate * span))
-    if noise.pose_error >= 0:
-        speed = math.sqrt(nav[3] * nav[3] + nav[4] * nav[4])
-        fade(nav, P, noise.pose_error, math.exp(-noise.pose_per_m * speed * span))
 
 
 @kernel()

@@ -24,6 +24,10 @@ class Parameters(NamedTuple):
     gnss_share: float
     """Of a position's variance, that lasts."""
     pose_share: float
+    gnss_rate: float
+    """How fast what lasts is forgotten, 1/s."""
+    pose_per_m: float
+    """The same of pose fixes along the road, 1/m."""
     increments: bool
     max_gap_ns: int
     bridge_ns: int

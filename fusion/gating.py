@@ -4,7 +4,7 @@ import math
 
 from fusion._linalg import Quaternion, Vector, exp_q, multiply, normalize
 from fusion.mechanization import refresh
-from fusion.state import G_COS, G_HEIGHT, G_MERIDIAN, G_SIN, G_TRANSVERSE, Floats
+from fusion.state import G_COS, G_HEIGHT, G_MERIDIAN, G_SIN, G_TRANSVERSE, LANE, Floats
 from sensors.kernel import kernel
 
 FAR_M = 10.0
@@ -94,8 +94,9 @@ def innovate(P: Floats, H: Floats, W: Floats, dof: int, R: Floats, L: Floats) ->
         for k in range(size):
             h = H[i, k]
             if h != 0.0:  # a sensor sees few of the states
-                for j in range(size):
-                    W[i, j] += h * P[k, j]
+                for first in range(0, size, LANE):
+                    for j in range(first, first + LANE):
+                        W[i, j] += h * P[k, j]
     for i in range(dof):
         for j in range(i + 1):
             total = R[i, j]
@@ -139,15 +140,16 @@ def shrink(P: Floats, W: Floats, dof: int) -> None:
     size = P.shape[0]
     for i in range(size):
         a, b, c = W[0, i], W[1, i], W[2, i]
-        if dof == 1:
-            for j in range(size):
-                P[i, j] -= a * W[0, j]
-        elif dof == 2:
-            for j in range(size):
-                P[i, j] -= a * W[0, j] + b * W[1, j]
-        else:
-            for j in range(size):
-                P[i, j] -= a * W[0, j] + b * W[1, j] + c * W[2, j]
+        for first in range(0, size, LANE):
+            if dof == 1:
+                for j in range(first, first + LANE):
+                    P[i, j] -= a * W[0, j]
+            elif dof == 2:
+                for j in range(first, first + LANE):
+                    P[i, j] -= a * W[0, j] + b * W[1, j]
+            else:
+                for j in range(first, first + LANE):
+                    P[i, j] -= a * W[0, j] + b * W[1, j] + c * W[2, j]
 
 
 @kernel(fastmath={"contract"})

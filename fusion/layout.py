@@ -6,12 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fusion.config import FusionConfig
-from fusion.state import ERROR_SIZE, Floats
+from fusion.state import ERROR_SIZE, LANE, Floats
 from sensors.vehicle import Vehicle
 
 OFF = -1
-_REGISTER = 8
-"""The number of states is filled up to a multiple of this."""
 
 
 class Layout(NamedTuple):
@@ -46,7 +44,7 @@ def layout_of(vehicle: Vehicle, config: FusionConfig) -> Layout:
         if sigma > 0.0:
             place[block] = first
             first += _COUNT.get(block, 1)
-    return Layout(size=-(-first // _REGISTER) * _REGISTER, **place)
+    return Layout(size=-(-first // LANE) * LANE, **place)
 
 
 def prior_variances(vehicle: Vehicle, config: FusionConfig) -> Floats:

@@ -14,9 +14,9 @@ from sensors.kernel import kernel
 
 FRESH_NS = 500_000_000
 """Rejections of both sensors within this belong together."""
-AGREEING = 2.3
-"""Largest squared distance of what they say, in variances as the filter inflates them: a quarter of 99 %."""
-VAGUE_VAR = 0.3**2
+AGREEING = 9.2
+"""Largest squared distance of what they say, in their variances: 99 %."""
+VAGUE_VAR = 0.15**2
 """Sensors that know less than this together agree by chance, m^2."""
 VELOCITY_VAR = 1.0**2
 """Doubt of the velocity, (m/s)^2."""
@@ -43,7 +43,8 @@ def in_doubt(core: Core, which: int, now: int) -> bool:
 
 @kernel()
 def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now: int) -> None:
-    """A position of sensor which was rejected: innovation z and core.R in axes whose first lies at ahead (cos, sin).
+    """A position of sensor which was rejected: innovation z and core.R (the white share of its covariance) in axes
+    whose first lies at ahead (cos, sin).
 
     After so many rejections in a row that agree with the other sensor's, P becomes wide enough for both.
     """
@@ -56,9 +57,10 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
         dt = (now - clock[which, D_TIME]) * 1e-9
         mine[6], mine[7] = (east - mine[0]) / dt, (north - mine[1]) / dt
     mine[0], mine[1], mine[2] = east, north, z[2]
-    mine[3] = c * c * R[0, 0] - 2.0 * c * s * R[0, 1] + s * s * R[1, 1]
-    mine[4] = c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1]
-    mine[5] = s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1]
+    whole = 1.0 / (1.0 - (par.gnss_share if which == 0 else par.pose_share))
+    mine[3] = whole * (c * c * R[0, 0] - 2.0 * c * s * R[0, 1] + s * s * R[1, 1])
+    mine[4] = whole * (c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1])
+    mine[5] = whole * (s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1])
     clock[which, D_COUNT] += 1
     clock[which, D_TIME] = now
     if clock[1 - which, D_COUNT] == 0 or now - clock[1 - which, D_TIME] > FRESH_NS:

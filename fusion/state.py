@@ -38,6 +38,8 @@ RING_SIZE = 2048
 
 ROW = ERROR_SIZE
 """Columns of the transition: nothing but these states moves by the IMU."""
+LANE = 8
+"""The number of states is a multiple of this: inner loops of so many fill vector registers."""
 
 # first rows of what Core.acc holds, each (3,) or (3, 3)
 A_S = 0
@@ -76,6 +78,8 @@ class Core(NamedTuple):
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
+    aged (3,): seconds since the lasting error of GNSS was moved on, metres since that of pose fixes was, and the
+    horizontal variance that the last GNSS position stated.
     doubt (2, 8), doubt_clock (2, 3) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
     phi (9, 16), M (9, n), Mt (16, 16), H, W (3, n), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (n,): scratch.
@@ -91,6 +95,7 @@ class Core(NamedTuple):
     ring: Floats
     ring_t: Nanoseconds
     quietest: Floats
+    aged: Floats
     doubt: Floats
     doubt_clock: Nanoseconds
     phi: Floats
@@ -118,6 +123,7 @@ def new_core(size: int = ERROR_SIZE) -> Core:
         ring=np.zeros((RING_SIZE, 6)),
         ring_t=np.zeros(RING_SIZE, np.int64),
         quietest=np.full(2, np.inf),
+        aged=np.zeros(3),
         doubt=np.zeros((2, 8)),
         doubt_clock=np.zeros((2, 3), np.int64),
         phi=np.zeros((9, ROW)),

@@ -51,14 +51,12 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
     noise = noise_of(vehicle.imu, config.imu.noise_scale, motion.wheel_scale_walk if motion.wheel else 0.0)
     noise = noise._replace(
         gyro_scale=layout.gyro_scale,
-        gnss_error=layout.gnss_error,
-        gnss_rate=1.0 / config.gnss.lasting_s,
-        pose_error=layout.pose_error,
-        pose_per_m=1.0 / pose.lasting_m,
     )
     return Parameters(
         noise=noise,
         layout=layout,
+        gnss_rate=1.0 / config.gnss.lasting_s,
+        pose_per_m=1.0 / pose.lasting_m,
         gnss_share=config.gnss.lasting_share,
         pose_share=pose.lasting_share,
         increments=vehicle.imu.samples == "increment",
