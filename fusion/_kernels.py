@@ -14,6 +14,7 @@ from fusion.blocks import arm_of, fade, lasting, renew, see_arm, see_delay
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
+from fusion.layout import OFF, Layout
 from fusion.measurements import Pair, gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
@@ -213,7 +214,7 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
         _record(rec, e, kind, 0, _RECEIVER)
         return
     else:
-        dof = _measure(core, par, m, kind, ev.row[e], rate)
+        dof = _measure(core, par, m, kind, ev.row[e], rate, True)
         if dof == 0:
             _record(rec, e, kind, 0, _COVARIANCE)
             return
@@ -221,13 +222,29 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
             accepted = _PARTLY
     k = _record(rec, e, kind, dof, _CHI_SQUARE)
     passed = _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
+    first = _lasting_of(par.layout, kind)
+    if not passed and first >= 0:  # what lasted may have changed all at once: then the state need not move for it
+        dof = _measure(core, par, m, kind, ev.row[e], rate, False)
+        known = innovate(core.P, core.H, core.W, dof, core.R, core.L)
+        if known and whiten(dof, core.residual, core.L) <= par.gate[dof - 1]:
+            renew(core.nav, core.P, first)
+            dof = _measure(core, par, m, kind, ev.row[e], rate, True)
+            passed = _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
     if kind in (_GNSS_POSITION, _POSE_FIX) and dof == 3:
         if passed:
-            believed(core, int(kind == _POSE_FIX))
+            believed(core, int(kind == _POSE_FIX), ev.t[e])
         elif kind == _POSE_FIX:
             doubted(core, par, 1, _triple(rec.innovation, k), heading(attitude(core.nav)), ev.t[e])
         else:
             doubted(core, par, 0, _triple(rec.innovation, k), (1.0, 0.0), ev.t[e])
+
+
+@kernel(inline="always")
+def _lasting_of(layout: Layout, kind: int) -> int:
+    """Where the lasting errors of a sensor stand, -1: nowhere."""
+    if kind == _GNSS_POSITION:
+        return layout.gnss_error
+    return layout.pose_error if kind == _POSE_FIX else OFF
 
 
 @kernel()
@@ -243,13 +260,16 @@ def _copy(cov: Floats, row: int, R: Floats) -> None:
 
 
 @kernel(inline="always")
-def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector) -> int:
-    """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom."""
+def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector, lasts: bool) -> int:
+    """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom.
+
+    lasts: let the states of errors that last carry their share of R; else R is whole, and they are not seen.
+    """
     nav, H, R = core.nav, core.H, core.R
     clear(H)
     r = attitude(nav)
     if kind == _POSE_FIX:
-        dof: int = _measure_pose(core, par, m, row, rate)
+        dof: int = _measure_pose(core, par, m, row, rate, lasts)
         return dof
     arm = arm_of(nav, par.layout, par.gnss_arm)
     if kind == _GNSS_POSITION:
@@ -270,12 +290,12 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
     if kind not in (_GNSS_POSITION, _GNSS_VELOCITY):
         return 1
     if H.shape[1] > ROW:
-        _see_receiver(core, par, r, kind == _GNSS_VELOCITY, rate)
+        _see_receiver(core, par, r, kind == _GNSS_VELOCITY, rate, lasts)
     return 3
 
 
 @kernel(inline="always")
-def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rate: Vector) -> None:
+def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rate: Vector, lasts: bool) -> None:
     """What the blocks add to an antenna's position or velocity."""
     nav, H, layout = core.nav, core.H, par.layout
     see_arm(H, layout, r, rate, of_velocity)
@@ -286,7 +306,7 @@ def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rat
             change = matvec(r, f)
             change = (change[0], change[1], change[2] - NORMAL_GRAVITY)
         see_delay(nav, H, core.residual, layout.gnss_delay, change)
-    if layout.gnss_error >= 0 and not of_velocity:
+    if layout.gnss_error >= 0 and lasts and not of_velocity:
         stated = core.R[0, 0] + core.R[1, 1]
         if 0.25 * core.aged[2] <= stated <= 4.0 * core.aged[2]:
             fade(nav, core.P, layout.gnss_error, math.exp(-par.gnss_rate * core.aged[0]))
@@ -297,7 +317,7 @@ def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rat
 
 
 @kernel(inline="always")
-def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: Vector) -> int:
+def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: Vector, lasts: bool) -> int:
     """Pose fix in vehicle axes; directions that the histogram does not observe are dropped; rate: body, rad/s."""
     R, nav, cov = core.R, core.nav, m.pose_cov
     r = attitude(nav)
@@ -315,10 +335,10 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
     R[2, 2] = cov[row, 2, 2]
     limits = par.pose_limits
     trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
-    _see_matching(core, par, (c, s), r[8] * rate[2])
+    _see_matching(core, par, (c, s), r[8] * rate[2], lasts)
     if trace <= 1.0:  # then every eigenvalue is
         return 3
-    if par.layout.pose_error >= 0:  # R is the white share only
+    if par.layout.pose_error >= 0 and lasts:  # R is the white share only
         white = np.sqrt(1.0 - par.pose_share)
         limits = (white * limits[0], white * limits[1], white * limits[2])
     kept: int = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
@@ -326,7 +346,7 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
 
 
 @kernel(inline="always")
-def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float) -> None:
+def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float, lasts: bool) -> None:
     """What the blocks add to a pose fix (along, left, yaw)."""
     nav, H, residual, layout = core.nav, core.H, core.residual, par.layout
     c, s = ahead
@@ -336,7 +356,7 @@ def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float) -> 
     if layout.pose_yaw >= 0:
         H[2, layout.pose_yaw] = 1.0
         residual[2] -= nav[layout.pose_yaw + 1]
-    if layout.pose_error >= 0:
+    if layout.pose_error >= 0 and lasts:
         fade(nav, core.P, layout.pose_error, math.exp(-par.pose_per_m * core.aged[1]))
         core.aged[1] = 0.0
         lasting(nav, H, core.R, residual, core.L, layout.pose_error, par.pose_share)

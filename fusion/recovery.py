@@ -1,7 +1,9 @@
-"""Back from a wrong state: when GNSS positions and pose fixes are both rejected and agree, the state gives way.
+"""Back from a wrong state: when what is rejected cannot be wrong itself, the state gives way.
 
 A rejection alone proves nothing: a wrong fix and an alias of the map are as steady as the truth. Two independent
-sensors that say the same place, while neither was accepted in between, outvote the state.
+sensors that say the same place, while neither was accepted in between, outvote the state. Where GNSS is alone the
+state's confidence decays as long as it is contradicted: what is little off is soon believed, a wrong fix a hundred
+sigmas away not before it has ended.
 """
 
 import math
@@ -9,7 +11,7 @@ import math
 from fusion._linalg import Vector, attitude, matvec
 from fusion.events import Parameters
 from fusion.measurements import Pair
-from fusion.state import D_AGREED, D_COUNT, D_TIME, E_WHEEL_SCALE, Core, Floats
+from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_TIME, E_WHEEL_SCALE, Core, Floats
 from sensors.kernel import kernel
 
 FRESH_NS = 500_000_000
@@ -22,14 +24,19 @@ VELOCITY_VAR = 1.0**2
 """Doubt of the velocity, (m/s)^2."""
 ATTITUDE_VAR = 0.02**2
 """Doubt of the attitude, rad^2."""
+ALONE_NS = 2_000_000_000
+"""GNSS is alone when no pose fix came for so long."""
+ALONE_DOUBLING_S = 4.0
+"""GNSS alone, rejected all the time: the state's sigmas double in this time."""
 WHEEL_SCALE_VAR = 0.02**2
 """Doubt of the wheel's scale."""
 
 
 @kernel()
-def believed(core: Core, which: int) -> None:
+def believed(core: Core, which: int, now: int) -> None:
     """A position of sensor which (0 GNSS, 1 pose fix) was accepted."""
     core.doubt_clock[which, D_COUNT] = 0
+    core.doubt_clock[which, D_BELIEVED] = now
     core.doubt_clock[0, D_AGREED] = 0
 
 
@@ -43,8 +50,8 @@ def in_doubt(core: Core, which: int, now: int) -> bool:
 
 @kernel()
 def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now: int) -> None:
-    """A position of sensor which was rejected: innovation z and core.R (the white share of its covariance) in axes
-    whose first lies at ahead (cos, sin).
+    """A position of sensor which was rejected: innovation z and core.R (its whole covariance) in axes whose first lies
+    at ahead (cos, sin).
 
     After so many rejections in a row that agree with the other sensor's, P becomes wide enough for both.
     """
@@ -57,10 +64,11 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
         dt = (now - clock[which, D_TIME]) * 1e-9
         mine[6], mine[7] = (east - mine[0]) / dt, (north - mine[1]) / dt
     mine[0], mine[1], mine[2] = east, north, z[2]
-    whole = 1.0 / (1.0 - (par.gnss_share if which == 0 else par.pose_share))
-    mine[3] = whole * (c * c * R[0, 0] - 2.0 * c * s * R[0, 1] + s * s * R[1, 1])
-    mine[4] = whole * (c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1])
-    mine[5] = whole * (s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1])
+    mine[3] = c * c * R[0, 0] - 2.0 * c * s * R[0, 1] + s * s * R[1, 1]
+    mine[4] = c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1]
+    mine[5] = s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1]
+    if which == 0 and clock[0, D_COUNT] > 0 and now - max(clock[1, D_TIME], clock[1, D_BELIEVED]) > ALONE_NS:
+        _forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9)
     clock[which, D_COUNT] += 1
     clock[which, D_TIME] = now
     if clock[1 - which, D_COUNT] == 0 or now - clock[1 - which, D_TIME] > FRESH_NS:
@@ -78,6 +86,16 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     if clock[0, D_AGREED] >= par.outvoted:
         _give_way(core.P, doubt)
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
+
+
+@kernel()
+def _forget(P: Floats, seconds: float) -> None:
+    """Widen position, velocity and attitude for the time that GNSS alone has contradicted them."""
+    grown = 2.0 ** (seconds / ALONE_DOUBLING_S)
+    for i in range(9):
+        for j in range(P.shape[0]):
+            P[i, j] *= grown
+            P[j, i] *= grown
 
 
 @kernel()
