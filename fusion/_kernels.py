@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._linalg import Matrix, Vector, attitude, axpy, blend, matvec
-from fusion.blocks import arm_of, fade, lasting, renew, see_arm, see_delay
+from fusion.blocks import arm_of, fade, lasting, renew, scale, see_arm, see_delay
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
@@ -306,14 +306,17 @@ def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rat
             change = matvec(r, f)
             change = (change[0], change[1], change[2] - NORMAL_GRAVITY)
         see_delay(nav, H, core.residual, layout.gnss_delay, change)
-    if layout.gnss_error >= 0 and lasts and not of_velocity:
+    if layout.gnss_error < 0 or of_velocity:
+        return
+    if lasts:
         stated = core.R[0, 0] + core.R[1, 1]
         if 0.25 * core.aged[2] <= stated <= 4.0 * core.aged[2]:
             fade(nav, core.P, layout.gnss_error, math.exp(-par.gnss_rate * core.aged[0]))
         else:  # another kind of solution, with errors of its own
             renew(nav, core.P, layout.gnss_error)
         core.aged[0], core.aged[2] = 0.0, stated
-        lasting(nav, H, core.R, core.residual, core.L, layout.gnss_error, par.gnss_share)
+        lasting(nav, H, core.R, core.residual, core.L, layout.gnss_error, par.gnss_shares[1])
+    scale(core.R, par.gnss_shares[0] + (0.0 if lasts else par.gnss_shares[1]))
 
 
 @kernel(inline="always")
@@ -338,9 +341,9 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
     _see_matching(core, par, (c, s), r[8] * rate[2], lasts)
     if trace <= 1.0:  # then every eigenvalue is
         return 3
-    if par.layout.pose_error >= 0 and lasts:  # R is the white share only
-        white = np.sqrt(1.0 - par.pose_share)
-        limits = (white * limits[0], white * limits[1], white * limits[2])
+    if par.layout.pose_error >= 0:  # R has been scaled
+        grown = math.sqrt(par.pose_shares[0] + (0.0 if lasts else par.pose_shares[1]))
+        limits = (grown * limits[0], grown * limits[1], grown * limits[2])
     kept: int = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
     return kept
 
@@ -356,10 +359,13 @@ def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float, las
     if layout.pose_yaw >= 0:
         H[2, layout.pose_yaw] = 1.0
         residual[2] -= nav[layout.pose_yaw + 1]
-    if layout.pose_error >= 0 and lasts:
+    if layout.pose_error < 0:
+        return
+    if lasts:
         fade(nav, core.P, layout.pose_error, math.exp(-par.pose_per_m * core.aged[1]))
         core.aged[1] = 0.0
-        lasting(nav, H, core.R, residual, core.L, layout.pose_error, par.pose_share)
+        lasting(nav, H, core.R, residual, core.L, layout.pose_error, par.pose_shares[1])
+    scale(core.R, par.pose_shares[0] + (0.0 if lasts else par.pose_shares[1]))
 
 
 @kernel(inline="always")

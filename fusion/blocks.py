@@ -1,7 +1,7 @@
 """What the optional error states (``fusion.layout``) add to residuals and Jacobians.
 
 Errors that last: a share c of a measurement's covariance R = L L' is that of sqrt(c) L x, x a first-order Gauss-Markov
-process of unit variance, the rest is white. So x follows the covariance that each fix states; it is correlated in time
+process of unit variance, another is white. So x follows the covariance that each fix states; it is correlated in time
 (GNSS: reflections, atmosphere) or along the road (pose fixes: map and features stand still when the vehicle does).
 """
 
@@ -39,7 +39,7 @@ def renew(nav: Floats, P: Floats, first: int) -> None:
 
 @kernel()
 def lasting(nav: Floats, H: Floats, R: Floats, residual: Floats, L: Floats, first: int, share: float) -> None:
-    """Let x (3) at first carry a share of R (3, 3), which keeps the rest; L (3, 3): scratch."""
+    """Let x (3) at first carry a share of R (3, 3); L (3, 3): scratch."""
     root = math.sqrt(share)
     for i in range(3):
         for j in range(i + 1):
@@ -54,9 +54,14 @@ def lasting(nav: Floats, H: Floats, R: Floats, residual: Floats, L: Floats, firs
         for j in range(i + 1):
             H[i, first + j] = root * L[i, j]
             residual[i] -= root * L[i, j] * nav[first + j + 1]
+
+
+@kernel()
+def scale(R: Floats, factor: float) -> None:
+    """Multiply R (3, 3)."""
     for i in range(3):
         for j in range(3):
-            R[i, j] *= 1.0 - share
+            R[i, j] *= factor
 
 
 @kernel()

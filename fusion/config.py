@@ -8,10 +8,10 @@ import msgspec
 from sensors.bounds import NonNegative, Positive, RateHz
 from sensors.errors import EgolocError
 
-Share = Annotated[float, msgspec.Meta(ge=0.0, le=0.95)]
-"""Some of a measurement's noise is white, or the filter would believe in differences without limit."""
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
 _NOT_ZERO = {
+    "white_share",
     "lasting_s",
     "lasting_m",
     "delay_sigma_s",
@@ -58,8 +58,11 @@ class GnssModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The same for velocity, m/s."""
     inflation: Positive = 1.0
     """Position variance is multiplied by this, -."""
+    white_share: Share = 0.7
+    """Share of that variance which may be white, -."""
     lasting_share: Share = 0.7
-    """Share of that variance which lasts (reflections, atmosphere, orbits): a state; 0: all of it is white, -."""
+    """Share of it which may last (reflections, atmosphere, orbits): a state. Which of both it is nobody tells, so they
+    may add up to more than 1; 0 with a white share of 1: all is white, -."""
     lasting_s: Positive = 30.0
     """Correlation time of that share, s."""
     velocity_inflation: Positive = 1.0
@@ -77,8 +80,10 @@ class PoseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Apply pose fixes at all."""
     inflation: Positive = 1.0
     """The fix's covariance is multiplied by this, -."""
+    white_share: Share = 0.7
+    """Share of that covariance which may be white, -."""
     lasting_share: Share = 0.7
-    """Share of that covariance which is bound to the place (map and features): a state; 0: all is white, -."""
+    """Share of it which may be bound to the place (map and features): a state; 0: none, -."""
     lasting_m: Positive = 300.0
     """Correlation length of that share along the road, m."""
     yaw_offset_sigma_deg: NonNegative = 0.1

@@ -21,9 +21,9 @@ class Parameters(NamedTuple):
 
     noise: Noise
     layout: Layout
-    gnss_share: float
-    """Of a position's variance, that lasts."""
-    pose_share: float
+    gnss_shares: tuple[float, float]
+    """Of a position's variance, which may be white and which may last."""
+    pose_shares: tuple[float, float]
     gnss_rate: float
     """How fast what lasts is forgotten, 1/s."""
     pose_per_m: float

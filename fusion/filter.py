@@ -56,5 +56,9 @@ class Localizer:
         return self._navigator.take_decisions()
 
     def covariance(self) -> Floats | None:
-        """(16, 16) covariance at the last use of P (a measurement or a recorded state), None before alignment."""
-        return None if self.core is None else self.core.P.copy()
+        """(n, n) covariance at the last use of P (a measurement or a recorded state), None before alignment.
+
+        n: the sixteen states of ``fusion.state`` and the configuration's blocks (``fusion.layout``).
+        """
+        count = self._navigator.state_count
+        return None if self.core is None else self.core.P[:count, :count].copy()

@@ -47,6 +47,15 @@ def layout_of(vehicle: Vehicle, config: FusionConfig) -> Layout:
     return Layout(size=-(-first // LANE) * LANE, **place)
 
 
+def used(layout: Layout) -> int:
+    """How many of the states there are, without what fills them up."""
+    last = ERROR_SIZE
+    for block, first in zip(Layout._fields[1:], layout[1:], strict=True):
+        if first != OFF:
+            last = max(last, first + _COUNT.get(block, 1))
+    return last
+
+
 def prior_variances(vehicle: Vehicle, config: FusionConfig) -> Floats:
     """(size,) variances of the blocks before anything is known of them; zero elsewhere."""
     layout = layout_of(vehicle, config)

@@ -13,7 +13,7 @@ from fusion._kernels import process
 from fusion.alignment import SERVING, Aligner, Initial
 from fusion.config import FusionConfig
 from fusion.events import OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
-from fusion.layout import prior_variances
+from fusion.layout import prior_variances, used
 from fusion.mechanization import refresh
 from fusion.recording import decisions, join, states, unused
 from fusion.result import Decisions, Reason, States
@@ -42,6 +42,7 @@ class Navigator:
         self._empty = Log(vehicle=vehicle, map_frame=map_frame)
         self._config, self._par = config, parameters(vehicle, config)
         self._priors = prior_variances(vehicle, config)
+        self.state_count = used(self._par.layout)
         self._aligner = Aligner(vehicle, config, self._par)
         self._kept_ns = round((config.alignment.window_s + kept_s) * NS_PER_S)
         self._rows = dict.fromkeys(RECORDS, 0)

@@ -68,6 +68,8 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     mine[4] = c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1]
     mine[5] = s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1]
     if which == 0 and clock[0, D_COUNT] > 0 and now - max(clock[1, D_TIME], clock[1, D_BELIEVED]) > ALONE_NS:
+        if clock[0, D_COUNT] == 1:
+            core.P[E_WHEEL_SCALE, E_WHEEL_SCALE] += WHEEL_SCALE_VAR
         _forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9)
     clock[which, D_COUNT] += 1
     clock[which, D_TIME] = now

@@ -27,13 +27,18 @@ Nanoseconds = NDArray[np.int64]
 
 FREE = FusionConfig(
     imu=ImuNoise(noise_scale=1.0, max_gap_s=0.5),
-    motion=MotionModel(zero_velocity=False, non_holonomic=False, wheel_scale_sigma=0.0, wheel_scale_walk=0.0),
+    gnss=GnssModel(inflation=4.0, lasting_share=0.0),
+    pose=PoseModel(inflation=4.0, lasting_share=0.0, yaw_offset_sigma_deg=0.0),
+    motion=MotionModel(
+        zero_velocity=False, non_holonomic=False, wheel_slip=0.0, wheel_scale_sigma=0.0, wheel_scale_walk=0.0
+    ),
 )
 """Nothing but what the log holds."""
 HONEST = FusionConfig(
     imu=ImuNoise(noise_scale=1.0, max_gap_s=0.5, coast_accel=3.0, coast_rate_deg=20.0),
     gnss=GnssModel(
         inflation=1.0,
+        lasting_share=0.0,
         velocity_inflation=1.0,
         sigma_floor_horizontal_m=0.0,
         sigma_floor_vertical_m=0.0,
@@ -42,6 +47,8 @@ HONEST = FusionConfig(
     ),
     pose=PoseModel(
         inflation=1.0,
+        lasting_share=0.0,
+        yaw_offset_sigma_deg=0.0,
         sigma_floor_m=0.0,
         sigma_floor_yaw_deg=0.0,
         max_sigma_longitudinal_m=0.47,
@@ -60,6 +67,7 @@ HONEST = FusionConfig(
         still_max_speed=0.3,
         zero_velocity_sigma=0.03,
         zero_rate_sigma_deg=0.1,
+        wheel_slip=0.0,
         wheel_scale_sigma=0.0,
         wheel_scale_walk=0.0,
     ),

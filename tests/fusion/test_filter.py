@@ -148,7 +148,7 @@ def test_covariance_is_that_of_the_last_recorded_state(log: Log) -> None:
     P = localizer.covariance()
     assert P is not None
     assert np.sqrt(np.diag(P))[:15] == pytest.approx(states.sigma[-1], rel=0.05)
-    assert P.shape == (16, 16)
+    assert P.shape == (23, 23)
     P[:] = 0.0  # a copy
     assert localizer.covariance() is not None
     assert np.diag(localizer.covariance())[0] > 0  # type: ignore[arg-type]

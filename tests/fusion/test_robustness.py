@@ -10,7 +10,7 @@ from fusion.config import FusionConfig, Gates
 from fusion.filter import Localizer
 from fusion.result import Reason, Sensor
 from fusion.run import run
-from fusion.state import WHEEL_SCALE
+from fusion.state import E_WHEEL_SCALE, WHEEL_SCALE
 from sensors.records import GnssStatus, Log
 from sensors.simulate import scenarios
 from sensors.simulate.drive import Drive, DriveConfig, simulate_drive
@@ -205,7 +205,7 @@ def test_the_wheels_scale_is_estimated(seed: int) -> None:
         assert record is not None
         localizer.push(record)
     assert localizer.core is not None
-    sigma = float(np.sqrt(localizer.core.P[-1, -1]))
+    sigma = float(np.sqrt(localizer.core.P[E_WHEEL_SCALE, E_WHEEL_SCALE]))
     found = float(localizer.core.nav[WHEEL_SCALE])
     print(f"wheel scale {true:.5f}, estimated {found:.5f} +- {sigma:.5f}")
     assert abs(true) > 0.001
