@@ -11,7 +11,7 @@ import math
 from fusion._linalg import Vector, attitude, matvec
 from fusion.events import Parameters
 from fusion.measurements import Pair
-from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_TIME, E_WHEEL_SCALE, Core, Floats
+from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_SINCE, D_TIME, E_WHEEL_SCALE, Core, Floats
 from sensors.kernel import kernel
 
 FRESH_NS = 500_000_000
@@ -28,6 +28,12 @@ ALONE_NS = 2_000_000_000
 """GNSS is alone when no pose fix came for so long."""
 ALONE_DOUBLING_S = 4.0
 """GNSS alone, rejected all the time: the state's sigmas double in this time."""
+LONG_NS = 8_000_000_000
+"""After so long the biases are doubted as well."""
+GYRO_BIAS_VAR = 0.0005**2
+"""Doubt of the gyro's bias, (rad/s)^2."""
+ACCEL_BIAS_VAR = 0.05**2
+"""Doubt of the accelerometer's bias, (m/s^2)^2."""
 WHEEL_SCALE_VAR = 0.02**2
 """Doubt of the wheel's scale."""
 
@@ -68,9 +74,11 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     mine[4] = c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1]
     mine[5] = s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1]
     if which == 0 and clock[0, D_COUNT] > 0 and now - max(clock[1, D_TIME], clock[1, D_BELIEVED]) > ALONE_NS:
-        if clock[0, D_COUNT] == 1:
-            core.P[E_WHEEL_SCALE, E_WHEEL_SCALE] += WHEEL_SCALE_VAR
+        if clock[0, D_TIME] - clock[0, D_SINCE] < LONG_NS <= now - clock[0, D_SINCE]:
+            _doubt_all(core.P)
         _forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9)
+    if clock[which, D_COUNT] == 0:
+        clock[which, D_SINCE] = now
     clock[which, D_COUNT] += 1
     clock[which, D_TIME] = now
     if clock[1 - which, D_COUNT] == 0 or now - clock[1 - which, D_TIME] > FRESH_NS:
@@ -88,6 +96,16 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     if clock[0, D_AGREED] >= par.outvoted:
         _give_way(core.P, doubt)
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
+
+
+@kernel()
+def _doubt_all(P: Floats) -> None:
+    """Widen what a wrong state has been taken in by: tilt, biases, the wheel's scale."""
+    for i in range(3):
+        P[6 + i, 6 + i] += ATTITUDE_VAR
+        P[9 + i, 9 + i] += GYRO_BIAS_VAR
+        P[12 + i, 12 + i] += ACCEL_BIAS_VAR
+    P[E_WHEEL_SCALE, E_WHEEL_SCALE] += WHEEL_SCALE_VAR
 
 
 @kernel()
@@ -118,6 +136,5 @@ def _give_way(P: Floats, doubt: Floats) -> None:
     P[2, 2] += doubt[0, 2] * doubt[0, 2]
     for i in range(3):
         P[3 + i, 3 + i] += VELOCITY_VAR
-        P[6 + i, 6 + i] += ATTITUDE_VAR
-    P[E_WHEEL_SCALE, E_WHEEL_SCALE] += WHEEL_SCALE_VAR
+    _doubt_all(P)
     P[8, 8] += doubt[1, 2] * doubt[1, 2]

@@ -62,7 +62,7 @@ ACC_SIZE = 15
 G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8)
 
 # entries of Core.doubt_clock
-D_COUNT, D_TIME, D_AGREED, D_BELIEVED = range(4)
+D_COUNT, D_TIME, D_AGREED, D_BELIEVED, D_SINCE = range(5)
 
 # entries of Core.clock
 C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)
@@ -80,7 +80,7 @@ class Core(NamedTuple):
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
     aged (3,): seconds since the lasting error of GNSS was moved on, metres since that of pose fixes was, and the
     horizontal variance that the last GNSS position stated.
-    doubt (2, 8), doubt_clock (2, 4) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
+    doubt (2, 8), doubt_clock (2, 5) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
     phi (9, 16), M (9, n), Mt (16, 16), H, W (3, n), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (n,): scratch.
     """
@@ -125,7 +125,7 @@ def new_core(size: int = ERROR_SIZE) -> Core:
         quietest=np.full(2, np.inf),
         aged=np.zeros(3),
         doubt=np.zeros((2, 8)),
-        doubt_clock=np.zeros((2, 4), np.int64),
+        doubt_clock=np.zeros((2, 5), np.int64),
         phi=np.zeros((9, ROW)),
         M=np.zeros((9, size)),
         Mt=np.zeros((ERROR_SIZE, ROW)),
