@@ -31,7 +31,7 @@ E_WHEEL_SCALE = 15
 ERROR_SIZE = 16
 
 RING_SIZE = 2048
-"""IMU samples kept to see whether the vehicle stands still."""
+"""IMU samples kept to see whether the vehicle stands still; a power of two."""
 
 
 ROW = ERROR_SIZE
@@ -70,11 +70,13 @@ class Core(NamedTuple):
     nav (17,); P (16, 16); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
     span (1,): seconds since P was propagated; acc (14, 3): the transition over them (A_*).
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
-    ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
+    ring (N, 6), ring_t (N,): latest IMU samples, N = RING_SIZE or a greater power of two.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
     doubt (2, 8), doubt_clock (2, 3) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
     phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
+    rate (3,): the body rate before the last sample, as events at its time saw it, rad/s.
+    kept (K,), saved (S, K), saved_t (S,), saves (2,) int64: snapshots (``fusion.history``); S = 0: none.
     """
 
     clock: Nanoseconds
@@ -99,6 +101,11 @@ class Core(NamedTuple):
     eigen: Floats
     residual: Floats
     dx: Floats
+    rate: Floats
+    kept: Nanoseconds
+    saved: Nanoseconds
+    saved_t: Nanoseconds
+    saves: Nanoseconds
 
 
 def new_core() -> Core:
@@ -126,4 +133,9 @@ def new_core() -> Core:
         eigen=np.zeros((2, 3, 3)),
         residual=np.zeros(3),
         dx=np.zeros(ROW),
+        rate=np.zeros(3),
+        kept=np.zeros(0, np.int64),
+        saved=np.zeros((0, 0), np.int64),
+        saved_t=np.zeros(0, np.int64),
+        saves=np.zeros(2, np.int64),
     )
