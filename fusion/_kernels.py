@@ -11,12 +11,12 @@ from fusion._linalg import Vector, attitude, axpy, blend, matvec
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import AGAIN, MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
-from fusion.history import save
 from fusion.measurements import gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
+from fusion.snapshots import S_CHANGED, save
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, Core, Floats
 from sensors._kernels import radii
 from sensors.kernel import kernel
@@ -67,6 +67,7 @@ def process(
         # the sample before the last one serves where the spacing is even to a quarter
         clock[C_BEND] = int(clock[C_INTERVAL] > 0 and 3 * whole <= 4 * clock[C_INTERVAL] <= 5 * whole)
         gap = whole > par.max_gap_ns
+        core.saves[S_CHANGED] |= gap
         interval = _interval(core.last, clock[C_BEND] != 0, par.increments, w, f)
         remembered = False
         while True:
@@ -98,6 +99,7 @@ def process(
             if not (guess and ev.kind[e] == MOTION):  # the rate in a gap is a guess
                 recorded, decided = rec.filled[0], rec.filled[1]
                 _handle(core, rec, par, m, ev, e, axpy(-1.0, (nav[10], nav[11], nav[12]), rate))
+                core.saves[S_CHANGED] = 1
                 if ev.verdict[e] == AGAIN:
                     rec.filled[0], rec.filled[1] = recorded, decided
             e += 1

@@ -32,13 +32,10 @@ from fusion.history import (
     M_TICK_PERIOD,
     NEW,
     PLAYED,
-    S_FIRST,
-    S_NEWEST,
     History,
-    restore,
-    snapshot_before,
 )
 from fusion.result import Reason
+from fusion.snapshots import S_FIRST, S_NEWEST, restore, snapshot_before
 from fusion.state import C_COUNT, C_STATE, Core, Floats, Nanoseconds
 from sensors.kernel import kernel
 
@@ -73,29 +70,28 @@ def arrive(
     i = j = 0
     while i < samples or j < count:
         due = inbox[j, I_DUE] if j < count else FOREVER
-        stop = i
-        while stop < samples and imu_due[stop] < due and stop - i < PLAYED:
-            _load(history, imu_t[stop], gyro, accel, stop)
-            stop += 1
-        if stop > i:
-            i = stop
+        begin = i
+        while i < samples and imu_due[i] < due and i - begin < PLAYED:
+            _load(history, imu_t[i], gyro, accel, i)
+            i += 1
+        if i > begin:
             _lay_grid(core, history, rec, stamps, imu_t[i - 1])
-            _play(core, history, par, rec, stamps)
-            continue
-        if mark[M_EVENTS] + count - j > len(history.arrival_ns):
-            _make_room(core, history, rec, stamps)
-        earliest = FOREVER
-        while j < count and inbox[j, I_DUE] == due:
-            earliest = min(earliest, _admit(core, history, j, rec, stamps))
-            j += 1
-        if earliest < FOREVER:
+        else:
+            if mark[M_EVENTS] + PLAYED > len(history.arrival_ns):
+                _make_room(core, history, rec, stamps)
+            earliest, stop = FOREVER, min(j + PLAYED, count)
+            while j < stop and inbox[j, I_DUE] == due:
+                earliest = min(earliest, _admit(core, history, j, rec, stamps))
+                j += 1
+            if earliest == FOREVER:
+                continue
             _rewind(core, history, earliest)
-            _play(core, history, par, rec, stamps)
+        _play(core, history, par, rec, stamps)
     while mark[M_FREE] < NEW:
         _make_room(core, history, rec, stamps)
 
 
-@kernel()
+@kernel(inline="always")
 def _load(history: History, t: int, gyro: Floats, accel: Floats, row: int) -> None:
     """Put an IMU sample into the ring."""
     ring = history.samples
@@ -106,7 +102,7 @@ def _load(history: History, t: int, gyro: Floats, accel: Floats, row: int) -> No
         ring.gyro[k, axis], ring.accel[k, axis] = gyro[row, axis], accel[row, axis]
 
 
-@kernel()
+@kernel(inline="always")
 def _lay_grid(core: Core, history: History, rec: Recorder, stamps: Nanoseconds, last: int) -> None:
     """Lay out motion ticks and outputs up to the last IMU sample."""
     mark = history.mark
@@ -125,7 +121,7 @@ def _lay_grid(core: Core, history: History, rec: Recorder, stamps: Nanoseconds, 
             mark[M_OUTPUT] += mark[M_OUTPUT_PERIOD]
 
 
-@kernel()
+@kernel(inline="always")
 def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: Nanoseconds) -> None:
     """Run the ring's samples after the state, with the events up to the last of them."""
     mark, played, every, size = history.mark, history.played, history.events, len(core.ring_t)
@@ -148,7 +144,7 @@ def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: 
             _remove(history, e, 1)
 
 
-@kernel()
+@kernel(inline="always")
 def _admit(core: Core, history: History, j: int, rec: Recorder, stamps: Nanoseconds) -> int:
     """Line measurement j of the inbox up among the events; the time to rewind to for it, FOREVER if there is no need.
 
@@ -174,7 +170,7 @@ def _admit(core: Core, history: History, j: int, rec: Recorder, stamps: Nanoseco
     return FOREVER
 
 
-@kernel()
+@kernel(inline="always")
 def _rewind(core: Core, history: History, t: int) -> None:
     """Go back to time t or before; the events from there on are the next to be met."""
     number = snapshot_before(core, history.mark[M_SAMPLES], t)
@@ -185,7 +181,7 @@ def _rewind(core: Core, history: History, t: int) -> None:
     history.mark[M_NEXT] = e
 
 
-@kernel()
+@kernel(inline="always")
 def _insert(history: History, t: int, kind: int, row: int, verdict: int, arrival: int, log_row: int) -> bool:
     """Put an event in its place by time and kind; False: there is one already."""
     events, n = history.events, history.mark[M_EVENTS]
@@ -202,7 +198,7 @@ def _insert(history: History, t: int, kind: int, row: int, verdict: int, arrival
     return True
 
 
-@kernel()
+@kernel(inline="always")
 def _move(history: History, source: int, target: int) -> None:
     events = history.events
     events.t[target], events.kind[target] = events.t[source], events.kind[source]
@@ -210,7 +206,7 @@ def _move(history: History, source: int, target: int) -> None:
     history.arrival_ns[target], history.log_row[target] = history.arrival_ns[source], history.log_row[source]
 
 
-@kernel()
+@kernel(inline="always")
 def _remove(history: History, first: int, count: int) -> None:
     """Forget events from the first on, all of them met."""
     mark = history.mark
@@ -222,7 +218,7 @@ def _remove(history: History, first: int, count: int) -> None:
     mark[M_NEXT] -= count
 
 
-@kernel()
+@kernel(inline="always")
 def _release(history: History, row: int) -> None:
     """A row of the measurements' columns is free again."""
     if row >= 0:
@@ -240,7 +236,7 @@ def _make_room(core: Core, history: History, rec: Recorder, stamps: Nanoseconds)
     count = max(mark[M_EVENTS] // 4, 1)
     met = min(count, mark[M_NEXT])
     while met > 0 and core.saves[S_FIRST] <= core.saves[S_NEWEST]:
-        if core.saved_t[core.saves[S_FIRST] % size] >= events.t[met - 1]:
+        if core.saved_t[core.saves[S_FIRST] % size, 0] >= events.t[met - 1]:
             break
         core.saves[S_FIRST] += 1
     for e in range(met, count):

@@ -80,6 +80,12 @@ class Navigator:
             raise EgolocError(f"Imu.t_ns: expected increasing stamps, got {imu.t_ns[0]} after {self.last_imu_ns}")
         self.last_imu_ns = int(imu.t_ns[-1])
 
+    def push(self, piece: Log) -> None:
+        """Take rows that come now, and go on as far as the IMU has come. Raises EgolocError as ``add`` does."""
+        self.add(piece)
+        if piece.imu is not None:
+            self.advance(self.last_imu_ns)
+
     def advance(self, known_ns: int) -> None:
         """Go on to known_ns at most, the time up to which every measurement has been added."""
         if not self._imu:
@@ -102,12 +108,14 @@ class Navigator:
 
     def take_states(self) -> States:
         """States recorded since the last call."""
-        taken, self._states = self._states, []
+        taken = self._states.copy()
+        self._states.clear()
         return join(taken or [states(new_recorder(0, 0))])
 
     def take_decisions(self) -> Decisions:
         """Decisions since the last call, in the order of application."""
-        taken, self._decisions = self._decisions, []
+        taken = self._decisions.copy()
+        self._decisions.clear()
         return join(taken or [unused(self._nothing, Reason.LATE)])
 
     def _align(self, imu: Imu, known_ns: int) -> Core | None:

@@ -10,17 +10,9 @@ from numpy.typing import NDArray
 from fusion.alignment import SERVING, Initial
 from fusion.arrival import arrive
 from fusion.config import FusionConfig
-from fusion.events import Measurements, Recorder, new_recorder
+from fusion.events import Measurements
 from fusion.history import (
-    I_ARRIVAL,
-    I_DUE,
-    I_KIND,
-    I_LOG_ROW,
-    I_ROW,
-    I_T,
-    I_VERDICT,
     M_EVENTS,
-    M_FREE,
     M_NEXT,
     M_OUTPUT,
     M_OUTPUT_PERIOD,
@@ -32,15 +24,18 @@ from fusion.history import (
     PLAYED,
     History,
     columns_for,
+    enter,
     new_history,
     read_only,
+    waiting,
     with_room,
-    with_snapshots,
 )
+from fusion.journal import Journal
 from fusion.navigator import FOREVER, NEVER, Navigator, start
-from fusion.recording import decided, states, unused
+from fusion.recording import unused
 from fusion.result import Decisions, Reason, States
-from fusion.sources import APPLY, Sources, compact, put
+from fusion.snapshots import with_snapshots
+from fusion.sources import APPLY, Sources, compact
 from fusion.state import C_STATE, Floats, Nanoseconds
 from fusion.timeline import periods
 from sensors import pieces
@@ -49,8 +44,8 @@ from sensors.geodesy import MapFrame
 from sensors.records import Imu, Log
 from sensors.vehicle import Vehicle
 
-_ROWS = 1024
-"""States and decisions that fit into a recorder, or more."""
+_WAIT_NS = 60 * NS_PER_S
+"""Without a first state, a pushed measurement waits for the IMU until it is so much older than another."""
 _NO_TIME = read_only(np.empty(0, np.int64))
 _NO_AXES = read_only(np.empty((0, 3)))
 
@@ -61,7 +56,7 @@ class RewindingNavigator(Navigator):
     def __init__(
         self, vehicle: Vehicle, map_frame: MapFrame | None, config: FusionConfig, kept: int | None = None
     ) -> None:
-        """kept: so many recorders with what was not taken are kept, the oldest are dropped; None: all."""
+        """kept: so many states and decisions are kept until they are taken, or a few more; None: all."""
         super().__init__(vehicle, map_frame, config, config.history_s)
         self._history_ns = round(config.history_s * NS_PER_S)
         self._due: list[Nanoseconds] = []
@@ -75,9 +70,7 @@ class RewindingNavigator(Navigator):
         """Of each sensor, the newest measurement that alignment has had."""
         self._history: History | None = None
         self._columns: Measurements
-        self._recorder: Recorder | None = None
-        self._stamps: Nanoseconds
-        self._kept = kept
+        self._journal = Journal(self._states, self._decisions, kept)
 
     def add(self, piece: Log) -> None:
         """Take the measurements and IMU samples of a piece; nothing is decided yet.
@@ -103,6 +96,8 @@ class RewindingNavigator(Navigator):
         if self.core is None:
             self.add(piece)
             self.advance(FOREVER)
+            if self.core is None and len(self.pending.t_ns):
+                self.decide(Reason.BEFORE_ALIGNMENT, int(self.pending.t_ns[-1]) - _WAIT_NS)
             return
         imu = piece.imu
         if imu is not None and len(imu):
@@ -133,18 +128,18 @@ class RewindingNavigator(Navigator):
         """Measurements up to last_ns (None: all) are decided: they are not applied, for this reason."""
         super().decide(reason, last_ns)
         if last_ns is None and self._history is not None:
-            self._flush()
-            self._decisions.append(unused(_waiting(self._history, self._nothing), reason))
+            self._journal.flush()
+            self._decisions.append(unused(waiting(self._history, self._nothing), reason))
             self._history.mark[M_EVENTS] = self._history.mark[M_NEXT]
 
     def take_states(self) -> States:
         """States recorded since the last call."""
-        self._flush()
+        self._journal.flush()
         return super().take_states()
 
     def take_decisions(self) -> Decisions:
         """Decisions since the last call, in the order in which they were made."""
-        self._flush()
+        self._journal.flush()
         return super().take_decisions()
 
     def _due_of(self, found: Sources) -> Nanoseconds:
@@ -234,7 +229,7 @@ class RewindingNavigator(Navigator):
         due: Nanoseconds,
     ) -> None:
         """Run the kernel over samples and at most NEW measurements, both sorted by when they are due."""
-        core, count = self.core, len(found.t_ns)
+        core = self.core
         assert core is not None
         assert self._history is not None
         mark = self._history.mark
@@ -244,11 +239,10 @@ class RewindingNavigator(Navigator):
             if mark[M_TICK_PERIOD]:
                 ticks = max(int(imu_t[-1] - mark[M_TICK]) // int(mark[M_TICK_PERIOD]) + 1, 0)
             self._history = with_room(self._history, self._most_at_once(imu_t))
-        rec = self._room(outputs + 1, ticks + count + int(mark[M_EVENTS] - mark[M_NEXT]) + 1)
-        if count:
-            self._enter(found, due)
+        count = enter(self._history, self._columns, found, due)
+        rec = self._journal.room(outputs + 1, ticks + count + int(mark[M_EVENTS] - mark[M_NEXT]) + 1)
         samples = read_only(imu_t), read_only(gyro), read_only(accel), read_only(imu_due)
-        arrive(core, self._history, *samples, count, self._par, rec, self._stamps)
+        arrive(core, self._history, *samples, count, self._par, rec, self._journal.stamps)
 
     def _most_at_once(self, imu_t: Nanoseconds) -> int:
         """Outputs and motion ticks over the samples that are played at a time."""
@@ -261,40 +255,6 @@ class RewindingNavigator(Navigator):
             span = int((edges[PLAYED:] - edges[:-PLAYED]).max())
         return span // int(mark[M_OUTPUT_PERIOD]) + (span // int(mark[M_TICK_PERIOD]) if mark[M_TICK_PERIOD] else 0) + 2
 
-    def _enter(self, found: Sources, due: Nanoseconds) -> None:
-        """Put measurements into rows of the history's columns and into its inbox."""
-        assert self._history is not None
-        mark, count = self._history.mark, len(found.t_ns)
-        mark[M_FREE] -= count
-        rows = self._history.free[mark[M_FREE] : mark[M_FREE] + count]
-        put(found, self._columns, rows)
-        inbox = self._history.inbox
-        inbox[:count, I_T], inbox[:count, I_KIND], inbox[:count, I_ROW] = found.t_ns, found.kind, rows
-        inbox[:count, I_VERDICT], inbox[:count, I_DUE] = found.verdict, due
-        inbox[:count, I_ARRIVAL], inbox[:count, I_LOG_ROW] = found.arrival_ns, found.log_row
-
-    def _room(self, recorded: int, decided: int) -> Recorder:
-        """A recorder that takes so many states and decisions more."""
-        rec = self._recorder
-        if rec is not None and rec.filled[0] + recorded <= len(rec.t) and rec.filled[1] + decided <= len(rec.event):
-            return rec
-        self._flush()
-        self._recorder = rec = new_recorder(max(recorded, _ROWS), max(decided, _ROWS))
-        self._stamps = np.zeros((len(rec.event), 3), np.int64)
-        return rec
-
-    def _flush(self) -> None:
-        """Line up what the recorder holds, to be taken."""
-        rec, self._recorder = self._recorder, None
-        if rec is None:
-            return
-        if rec.filled[0]:
-            self._states.append(states(rec))
-        if rec.filled[1]:
-            self._decisions.append(decided(rec, *self._stamps[: int(rec.filled[1])].T.copy()))
-        if self._kept is not None:
-            del self._states[: -self._kept], self._decisions[: -self._kept]
-
 
 def _ready(
     t_ns: Nanoseconds, due: Nanoseconds, imu_t: Nanoseconds, imu_due: Nanoseconds
@@ -303,18 +263,3 @@ def _ready(
     k = np.searchsorted(imu_t, t_ns)
     reached = np.where(k < len(imu_t), imu_due[np.minimum(k, len(imu_t) - 1)], FOREVER)
     return np.maximum(due, reached), due <= reached
-
-
-def _waiting(history: History, nothing: Sources) -> Sources:
-    """Measurements that the IMU has not reached."""
-    rows = slice(int(history.mark[M_NEXT]), int(history.mark[M_EVENTS]))
-    events = history.events
-    return Sources(
-        nothing.measurements,
-        events.t[rows].copy(),
-        history.arrival_ns[rows].copy(),
-        events.kind[rows].copy(),
-        events.row[rows].copy(),
-        history.log_row[rows].copy(),
-        events.verdict[rows].copy(),
-    )

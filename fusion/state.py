@@ -76,7 +76,7 @@ class Core(NamedTuple):
     phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
     rate (3,): the body rate before the last sample, as events at its time saw it, rad/s.
-    kept (K,), saved (S, K), saved_t (S,), saves (2,) int64: snapshots (``fusion.history``); S = 0: none.
+    kept (K,), saved (S, K), saved_cov (S, n, n), saved_t (S, 2), saves (4,): ``fusion.snapshots``; S = 0: none.
     """
 
     clock: Nanoseconds
@@ -104,6 +104,7 @@ class Core(NamedTuple):
     rate: Floats
     kept: Nanoseconds
     saved: Nanoseconds
+    saved_cov: Floats
     saved_t: Nanoseconds
     saves: Nanoseconds
 
@@ -136,6 +137,7 @@ def new_core() -> Core:
         rate=np.zeros(3),
         kept=np.zeros(0, np.int64),
         saved=np.zeros((0, 0), np.int64),
-        saved_t=np.zeros(0, np.int64),
-        saves=np.zeros(2, np.int64),
+        saved_cov=np.zeros((0, ERROR_SIZE, ERROR_SIZE)),
+        saved_t=np.zeros((0, 2), np.int64),
+        saves=np.zeros(4, np.int64),
     )
