@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusion._linalg import Matrix, Vector, attitude, axpy, blend, matvec
 from fusion.blocks import arm_of, fade, lasting, renew, scale, see_arm, see_delay
 from fusion.covariance import accumulate, coast, propagate, widen
-from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
+from fusion.events import AGAIN, MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
 from fusion.layout import OFF, Layout
 from fusion.measurements import Pair, gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
@@ -20,7 +20,8 @@ from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
-from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, ROW, Core, Floats
+from fusion.snapshots import S_CHANGED, save
+from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, ROW, Core, Floats
 from sensors._kernels import radii
 from sensors.kernel import kernel
 
@@ -72,6 +73,7 @@ def process(
         # the sample before the last one serves where the spacing is even to a quarter
         clock[C_BEND] = int(clock[C_INTERVAL] > 0 and 3 * whole <= 4 * clock[C_INTERVAL] <= 5 * whole)
         gap = whole > par.max_gap_ns
+        core.saves[S_CHANGED] |= gap
         interval = _interval(core.last, clock[C_BEND] != 0, par.increments, w, f)
         remembered = False
         while True:
@@ -91,14 +93,22 @@ def process(
                 clock[C_STATE] = stop
             if stop == t and not remembered:
                 _remember(core, t, w, f)
+                save(core, blend(interval[0], interval[1], 1.0))
                 remembered = True
             if stop < target:
                 continue
             if e >= events or ev.t[e] > stop:
                 break
             rate = blend(interval[0], interval[1], (stop - start) / whole) if whole > 0 else w
-            if not (gap and ev.kind[e] == MOTION):  # the rate in a gap is a guess
+            guess = gap
+            if stop == start < t:  # after a rewind to the sample before
+                rate, guess = (core.rate[0], core.rate[1], core.rate[2]), clock[C_INTERVAL] > par.max_gap_ns
+            if not (guess and ev.kind[e] == MOTION):  # the rate in a gap is a guess
+                recorded, decided = rec.filled[0], rec.filled[1]
                 _handle(core, rec, par, m, ev, e, axpy(-1.0, (nav[10], nav[11], nav[12]), rate))
+                core.saves[S_CHANGED] = 1
+                if ev.verdict[e] == AGAIN:
+                    rec.filled[0], rec.filled[1] = recorded, decided
             e += 1
     return e
 
@@ -169,7 +179,7 @@ def _remember(core: Core, t: int, w: Vector, f: Vector) -> None:
     """Keep a sample as the last one and in the ring."""
     core.clock[C_INTERVAL] = t - core.clock[C_SAMPLE]
     core.clock[C_SAMPLE] = t
-    k = core.clock[C_COUNT] % RING_SIZE
+    k = core.clock[C_COUNT] & (len(core.ring_t) - 1)
     core.ring_t[k] = t
     for j in range(3):
         core.last[1, j], core.last[1, 3 + j] = core.last[0, j], core.last[0, 3 + j]

@@ -1,7 +1,7 @@
 """Every tunable number of the filter: a default, a unit, one line of meaning."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -26,6 +26,9 @@ _NOT_ZERO = {
     "max_sigma_lateral_m",
     "max_sigma_yaw_deg",
 }
+
+LONGEST_HISTORY_S = 10.0
+"""Of IMU samples and measurements to rewind over."""
 
 
 class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -194,6 +197,10 @@ class FusionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     output_hz: RateHz = 10.0
     """Rate of the recorded states, Hz."""
+    order: Literal["stamp", "arrival"] = "stamp"
+    """stamp: measurements are applied by when they were true; arrival: by when they came, late ones by rewinding."""
+    history_s: Annotated[float, msgspec.Meta(gt=0, le=LONGEST_HISTORY_S)] = 1.0
+    """Arrival order: a measurement that comes later than this is not applied, s."""
     imu: ImuNoise = ImuNoise()
     gnss: GnssModel = GnssModel()
     pose: PoseModel = PoseModel()
@@ -209,6 +216,11 @@ def check(config: msgspec.Struct, path: str = "fusion") -> None:
         value, key = getattr(config, name), f"{path}.{name}"
         if isinstance(value, msgspec.Struct):
             check(value, key)
+        elif name == "order":
+            if value not in ("stamp", "arrival"):
+                raise EgolocError(f'config: {key}: expected "stamp" or "arrival", got {value!r}')
+        elif name == "history_s" and not 0.0 < value <= LONGEST_HISTORY_S:
+            raise EgolocError(f"config: {key}: expected a number above 0 and up to {LONGEST_HISTORY_S:g}, got {value}")
         elif name == "probability" and not 0.5 <= value < 1.0:
             raise EgolocError(f"config: {key}: expected 0.5..1, got {value}")
         elif not 0.0 <= value < math.inf or (value == 0.0 and name in _NOT_ZERO):

@@ -14,6 +14,8 @@ MOTION = 100
 """Event: see whether the vehicle stands, then apply zero velocity or the non-holonomic constraint."""
 OUTPUT = 101
 """Event: record the state."""
+AGAIN = -2
+"""Verdict on an event that was applied and recorded before, and is applied once more after a rewind."""
 
 
 class Parameters(NamedTuple):
@@ -82,7 +84,7 @@ class Measurements(NamedTuple):
 
 class Events(NamedTuple):
     """What happens when, sorted: t (M,) ns; kind (M,) Sensor, MOTION or OUTPUT; row (M,) into its sensor's columns;
-    verdict (M,) int8: -1 to apply, else the Reason that is only recorded."""
+    verdict (M,) int8: -1 to apply, AGAIN, or the Reason that is only recorded."""
 
     t: NDArray[np.int64]
     kind: NDArray[np.int8]
@@ -91,7 +93,7 @@ class Events(NamedTuple):
 
 
 class Recorder(NamedTuple):
-    """Output arrays, filled from ``filled`` = (states, decisions) on.
+    """Output arrays, filled from ``filled`` = (states, decisions) on; an event met AGAIN needs a row of them to itself.
 
     States: t (N,), nav (N, 16) and sigma_state (N, 15) without the wheel scale, pose_cov (N, 6, 6). Decisions: event
     (M,) index of the event; sensor, reason, dof (M,) int8; innovation, sigma (M, 3); scores (M, 4): NIS, threshold,

@@ -1,13 +1,19 @@
 """Streaming filter: records in, states out, over the same kernels as the batch run and bit-identical to it.
 
-Measurements are applied in stamp order: each waits until the IMU has passed its time, and one that is older than the
-state is not applied (arrival order, with rewinding, is a matter of ordering and lives outside the core).
+In arrival order (for live use) a measurement is applied as soon as it comes and the IMU has reached its time, late ones
+by rewinding. In stamp order each waits until the IMU has passed its time, and one that is older than the state is not
+applied.
 """
 
+from typing import NamedTuple
+
 from fusion.config import FusionConfig
+from fusion.covariance import propagate
 from fusion.navigator import Navigator
 from fusion.result import Decisions, States
-from fusion.state import C_STATE, Core, Floats
+from fusion.rewinding import RewindingNavigator
+from fusion.state import ACCEL_BIAS, C_STATE, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core, Floats
+from fusion.timeline import parameters
 from sensors.geodesy import MapFrame
 from sensors.records import GnssFix, GnssVelocity, Imu, Log, PoseFix, WheelSpeed
 from sensors.vehicle import Vehicle
@@ -15,50 +21,82 @@ from sensors.vehicle import Vehicle
 Measurement = GnssFix | GnssVelocity | PoseFix | WheelSpeed
 
 _KEPT_S = 60.0
-"""IMU samples kept while not aligned, for measurements that come late, s."""
+"""Stamp order: IMU samples kept while not aligned, for measurements that come late, s."""
+_KEPT = 10_000
+"""Arrival order: so many states and decisions are kept until they are taken."""
 _NAMES = {Imu: "imu", GnssFix: "gnss", GnssVelocity: "gnss_velocity", PoseFix: "pose_fixes", WheelSpeed: "wheel"}
 
 
+class State(NamedTuple):
+    """The state at t_ns: llh (3,) rad, rad, m; vel_enu (3,) m/s; q_enu_body (4,) xyzw; gyro_bias (3,) rad/s;
+    accel_bias (3,) m/s^2."""
+
+    t_ns: int
+    llh: Floats
+    vel_enu: Floats
+    q_enu_body: Floats
+    gyro_bias: Floats
+    accel_bias: Floats
+
+
 class Localizer:
-    """Push records of one or more rows as they come; read ``core`` or take the recorded states and decisions.
+    """Push records of one or more rows as they come; ask for the state, take the recorded states and decisions.
 
     States are recorded on multiples of the output period, as ``fusion.run`` does; rows count pushed measurements of
-    each sensor from zero, in the order of pushing. A measurement with the stamp of an IMU sample goes before it.
+    each sensor from zero, in the order of pushing. A measurement with the stamp of an IMU sample goes before it. In
+    arrival order rows count as arrived when they are pushed, memory is constant, and of what is not taken the oldest is
+    dropped after 10,000 states or decisions.
     """
 
     def __init__(
         self, vehicle: Vehicle | None = None, map_frame: MapFrame | None = None, config: FusionConfig | None = None
     ) -> None:
-        self._navigator = Navigator(vehicle or Vehicle(), map_frame, config or FusionConfig(), _KEPT_S)
+        vehicle, config = vehicle or Vehicle(), config or FusionConfig()
+        self._noise = parameters(vehicle, config).noise
+        self._navigator: Navigator
+        if config.order == "arrival":
+            self._navigator = RewindingNavigator(vehicle, map_frame, config, _KEPT)
+        else:
+            self._navigator = Navigator(vehicle, map_frame, config, _KEPT_S)
 
     @property
     def core(self) -> Core | None:
-        """The filter's state; None before alignment."""
+        """The filter's memory; None before alignment."""
         return self._navigator.core
 
     @property
     def t_ns(self) -> int | None:
-        """Time of the state; None before alignment."""
+        """Time of the state, that of the last IMU sample; None before alignment."""
         return None if self.core is None else int(self.core.clock[C_STATE])
 
     def push(self, record: Imu | Measurement) -> None:
         """Take an IMU record or a measurement. IMU stamps must rise; raises EgolocError where they do not."""
-        self._navigator.add(Log(**{_NAMES[type(record)]: record}))  # type: ignore[arg-type]
-        if isinstance(record, Imu):
-            self._navigator.advance(self._navigator.last_imu_ns)
+        self._navigator.push(Log(**{_NAMES[type(record)]: record}))  # type: ignore[arg-type]
+
+    def state(self) -> State | None:
+        """The state now, at the last IMU sample; None before alignment."""
+        if self.core is None:
+            return None
+        nav = self.core.nav.copy()
+        parts = (nav[LLH], nav[VELOCITY], nav[QUATERNION], nav[GYRO_BIAS], nav[ACCEL_BIAS])
+        return State(int(self.core.clock[C_STATE]), *parts)
+
+    def covariance(self) -> Floats | None:
+        """(n, n) covariance of the state now; None before alignment.
+
+        n: the sixteen states of ``fusion.state`` and the configuration's blocks (``fusion.layout``).
+        """
+        core = self.core
+        if core is None:
+            return None
+        P, scratch = core.P.copy(), (core.phi, core.M, core.Mt)
+        propagate(core.nav, core.earth, P, core.acc.copy(), core.span.copy(), scratch, self._noise)
+        return P[: self._navigator.state_count, : self._navigator.state_count]
 
     def take_states(self) -> States:
         """States recorded since the last call."""
         return self._navigator.take_states()
 
     def take_decisions(self) -> Decisions:
-        """Decisions since the last call, in the order of application."""
+        """Decisions since the last call, in the order in which they were made."""
         return self._navigator.take_decisions()
-
-    def covariance(self) -> Floats | None:
-        """(n, n) covariance at the last use of P (a measurement or a recorded state), None before alignment.
-
-        n: the sixteen states of ``fusion.state`` and the configuration's blocks (``fusion.layout``).
-        """
-        count = self._navigator.state_count
-        return None if self.core is None else self.core.P[:count, :count].copy()

@@ -42,7 +42,7 @@ def shaking(
     n, fresh = 0, 0
     oldest = now
     for back in range(min(count, RING_SIZE)):
-        i = (count - 1 - back) % RING_SIZE
+        i = (count - 1 - back) & (len(ring_t) - 1)
         t = ring_t[i]
         if t <= now - window_ns:
             break

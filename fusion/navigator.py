@@ -4,20 +4,19 @@ Whatever is given in one call or in many, the same operations run in the same or
 """
 
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion._kernels import process
 from fusion.alignment import SERVING, Aligner, Initial
 from fusion.config import FusionConfig
 from fusion.events import OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
+from fusion.history import read_only
 from fusion.layout import prior_variances, used
 from fusion.mechanization import refresh
 from fusion.recording import decisions, join, states, unused
 from fusion.result import Decisions, Reason, States
-from fusion.sources import APPLY, RECORDS, joined, sources, split
+from fusion.sources import APPLY, RECORDS, Sources, joined, parts, sources, split
 from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, ERROR_SIZE, NAV_SIZE, Core, Floats, new_core
 from fusion.timeline import merge, parameters
 from sensors import pieces
@@ -27,9 +26,7 @@ from sensors.geodesy import MapFrame
 from sensors.records import Imu, Log
 from sensors.vehicle import Vehicle
 
-Scalar = TypeVar("Scalar", np.int64, np.float64)
-
-_NEVER, _EVER = 2**63 - 1, -(2**63)
+FOREVER, NEVER = 2**63 - 1, -(2**63)
 """After and before any stamp."""
 
 
@@ -51,8 +48,8 @@ class Navigator:
         self._decisions: list[Decisions] = []
         self._states: list[States] = []
         self.pending = self._nothing = sources(self._empty, config)
-        self._first_imu_ns = _NEVER
-        self.last_imu_ns = _EVER
+        self._first_imu_ns = FOREVER
+        self.last_imu_ns = NEVER
         self.core: Core | None = None
         self.aligned_ns: int | None = None
 
@@ -61,21 +58,36 @@ class Navigator:
 
         Raises EgolocError where IMU stamps do not go on rising.
         """
-        records = {name: getattr(piece, name) for name in RECORDS}
-        found = sources(replace(self._empty, **records), self._config, self._rows)
-        for name, record in records.items():
-            self._rows[name] += 0 if record is None else len(record)
+        found = joined([self._nothing, *self._found(piece)])
         if len(found.t_ns):
             self.pending = joined((self.pending, found)) if len(self.pending.t_ns) else found
         if piece.imu is not None and len(piece.imu):
             self._add_imu(piece.imu)
 
+    def _found(self, piece: Log) -> list[Sources]:
+        """The measurements of a piece, of each sensor for itself."""
+        records = {name: getattr(piece, name) for name in RECORDS}
+        found = parts(replace(self._empty, **records), self._config, self._rows)
+        for name, record in records.items():
+            self._rows[name] += 0 if record is None else len(record)
+        return found
+
     def _add_imu(self, imu: Imu) -> None:
+        self._check_rising(imu)
+        self._first_imu_ns = self._aligner.first_imu_ns = min(self._first_imu_ns, int(imu.t_ns[0]))
+        self._imu.append(imu)
+
+    def _check_rising(self, imu: Imu) -> None:
+        """Raise unless the samples go on; they are the last ones from now on."""
         if imu.t_ns[0] <= self.last_imu_ns:
             raise EgolocError(f"Imu.t_ns: expected increasing stamps, got {imu.t_ns[0]} after {self.last_imu_ns}")
-        self._first_imu_ns = self._aligner.first_imu_ns = min(self._first_imu_ns, int(imu.t_ns[0]))
         self.last_imu_ns = int(imu.t_ns[-1])
-        self._imu.append(imu)
+
+    def push(self, piece: Log) -> None:
+        """Take rows that come now, and go on as far as the IMU has come. Raises EgolocError as ``add`` does."""
+        self.add(piece)
+        if piece.imu is not None:
+            self.advance(self.last_imu_ns)
 
     def advance(self, known_ns: int) -> None:
         """Go on to known_ns at most, the time up to which every measurement has been added."""
@@ -99,12 +111,14 @@ class Navigator:
 
     def take_states(self) -> States:
         """States recorded since the last call."""
-        taken, self._states = self._states, []
+        taken = self._states.copy()
+        self._states.clear()
         return join(taken or [states(new_recorder(0, 0))])
 
     def take_decisions(self) -> Decisions:
         """Decisions since the last call, in the order of application."""
-        taken, self._decisions = self._decisions, []
+        taken = self._decisions.copy()
+        self._decisions.clear()
         return join(taken or [unused(self._nothing, Reason.LATE)])
 
     def _align(self, imu: Imu, known_ns: int) -> Core | None:
@@ -169,11 +183,5 @@ def feed(core: Core, imu: Imu, events: Events, measurements: Measurements, par: 
 
     Every column goes in read-only and contiguous: one compiled kernel serves every log, whatever its sensors.
     """
-    columns = Measurements(*(_read_only(column) for column in measurements))
-    process(core, _read_only(imu.t_ns), _read_only(imu.gyro), _read_only(imu.accel), events, 0, columns, par, rec)
-
-
-def _read_only(column: NDArray[Scalar]) -> NDArray[Scalar]:
-    view = np.ascontiguousarray(column).view()
-    view.flags.writeable = False
-    return view
+    columns = Measurements(*(read_only(column) for column in measurements))
+    process(core, read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel), events, 0, columns, par, rec)

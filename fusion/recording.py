@@ -10,7 +10,7 @@ from fusion.alignment import Initial
 from fusion.events import Recorder
 from fusion.result import Decisions, Reason, States
 from fusion.sources import APPLY, Sources
-from fusion.state import ACCEL_BIAS, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Floats
+from fusion.state import ACCEL_BIAS, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Floats, Nanoseconds
 from fusion.timeline import Timeline
 from sensors.pieces import joined
 
@@ -35,13 +35,19 @@ def states(rec: Recorder) -> States:
 
 def decisions(rec: Recorder, timeline: Timeline) -> Decisions:
     """The recorder's decisions with the times and log rows of their events."""
+    event = rec.event[: int(rec.filled[1])]
+    return decided(rec, timeline.events.t[event], timeline.arrival_ns[event], timeline.log_row[event])
+
+
+def decided(rec: Recorder, t_ns: Nanoseconds, arrival_ns: Nanoseconds, log_row: Nanoseconds) -> Decisions:
+    """The recorder's decisions with their times and log rows, each (M,)."""
     n = int(rec.filled[1])
-    event, scores = rec.event[:n], rec.scores[:n]
+    scores = rec.scores[:n]
     return Decisions(
-        timeline.events.t[event],
-        timeline.arrival_ns[event],
+        t_ns,
+        arrival_ns,
         rec.sensor[:n],
-        timeline.log_row[event],
+        log_row,
         rec.reason[:n],
         rec.innovation[:n],
         rec.sigma[:n],

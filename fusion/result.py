@@ -41,9 +41,11 @@ class Reason(IntEnum):
     """No IMU samples at this time."""
     USED_FOR_ALIGNMENT = 8
     LATE = 9
-    """Older than the state when it came (live use)."""
+    """Came when the state had passed its time (in arrival order: by more than the history)."""
     RECEIVER = 10
     """GNSS velocity: the receiver's position was rejected at the same time, and reflections upset both."""
+    DUPLICATE = 11
+    """Arrival order: the sensor's measurement of this time is there already."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

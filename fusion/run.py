@@ -3,9 +3,10 @@
 import numpy as np
 
 from fusion.config import FusionConfig
-from fusion.navigator import Navigator
+from fusion.navigator import FOREVER, Navigator
 from fusion.recording import join
 from fusion.result import FusionResult, Reason
+from fusion.rewinding import RewindingNavigator
 from fusion.sources import RECORDS
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
@@ -28,7 +29,8 @@ class Session:
 
     def __init__(self, vehicle: Vehicle, map_frame: MapFrame | None = None, config: FusionConfig | None = None) -> None:
         self._config = config or FusionConfig()
-        self._navigator = Navigator(vehicle, map_frame, self._config)
+        kind = RewindingNavigator if self._config.order == "arrival" else Navigator
+        self._navigator: Navigator = kind(vehicle, map_frame, self._config)
         self._held_ns = max(0, *(round(s * 1e9) for s in (vehicle.gnss_delay_s, vehicle.gnss_velocity_delay_s)))
         self._samples = 0
 
@@ -51,7 +53,7 @@ class Session:
         """The rest of the drive. Raises EgolocError if it had no IMU."""
         if self._samples < 2:
             raise EgolocError("the log has no IMU samples: expected sensor_msgs/msg/Imu on a topic")
-        self._navigator.advance(self._navigator.last_imu_ns)
+        self._navigator.advance(FOREVER)
         aligned = self._navigator.aligned_ns is not None
         self._navigator.decide(Reason.OUTSIDE_IMU if aligned else Reason.BEFORE_ALIGNMENT)
         return self._result(())

@@ -79,10 +79,19 @@ def joined(parts: Sequence[Sources]) -> Sources:
 def split(found: Sources, last_ns: int) -> tuple[Sources, Sources]:
     """Measurements up to last_ns, and those after it."""
     count = int(np.searchsorted(found.t_ns, last_ns, side="right"))
-    return found.chosen(slice(count)), _compact(found.chosen(slice(count, None)))
+    return found.chosen(slice(count)), compact(found.chosen(slice(count, None)))
 
 
-def _compact(found: Sources) -> Sources:
+def put(found: Sources, columns: Measurements, rows: Rows) -> None:
+    """Write the numbers of each measurement into these rows (M,) of other columns."""
+    for sensor in set(found.kind.tolist()):
+        mine = np.flatnonzero(found.kind == sensor)
+        for column, given, whose in zip(columns, found.measurements, _SENSORS, strict=True):
+            if whose == sensor:
+                column[rows[mine]] = given[found.row[mine]]
+
+
+def compact(found: Sources) -> Sources:
     """The same measurements without the columns' rows of others."""
     columns, row = list(found.measurements), found.row.copy()
     for sensor in dict.fromkeys(_SENSORS):
@@ -93,28 +102,33 @@ def _compact(found: Sources) -> Sources:
 
 
 def sources(log: Log, config: FusionConfig, first_rows: Mapping[str, int] | None = None) -> Sources:
-    """Every measurement of a log with its effective covariance.
+    """Every measurement of a log, sorted: see ``parts``."""
+    return joined([_NOTHING, *parts(log, config, first_rows)])
+
+
+def parts(log: Log, config: FusionConfig, first_rows: Mapping[str, int] | None = None) -> list[Sources]:
+    """The measurements of a log with their effective covariances, of each sensor for itself.
 
     first_rows: of each of RECORDS, in the drive's. Raises EgolocError when the log holds pose fixes but no map frame to
     place them.
     """
     first = first_rows or dict.fromkeys(RECORDS, 0)
-    parts = [_NOTHING]
+    found = list[Sources]()
     if log.gnss is not None:
-        parts += _gnss(log.gnss, log.vehicle, config, first["gnss"])
+        found += _gnss(log.gnss, log.vehicle, config, first["gnss"])
     if log.gnss_velocity is not None:
-        parts.append(_velocity(log.gnss_velocity, log.vehicle, config, first["gnss_velocity"]))
+        found.append(_velocity(log.gnss_velocity, log.vehicle, config, first["gnss_velocity"]))
     if log.pose_fixes is not None:
         if log.map_frame is None:
             raise EgolocError(
                 "the log has pose fixes but no map frame: expected [map_frame] in its metadata or the config"
             )
-        parts.append(_poses(log.pose_fixes, log.map_frame, config, first["pose_fixes"]))
+        found.append(_poses(log.pose_fixes, log.map_frame, config, first["pose_fixes"]))
     if log.wheel is not None:
         columns = {"wheel": log.wheel.speed, "wheel_var": log.wheel.sigma**2 * config.motion.wheel_inflation}
         verdict = _switch(config.motion.wheel, len(log.wheel))
-        parts.append(_of(Sensor.WHEEL, log.wheel, 0.0, columns, verdict, first["wheel"]))
-    return joined(parts)
+        found.append(_of(Sensor.WHEEL, log.wheel, 0.0, columns, verdict, first["wheel"]))
+    return found
 
 
 def _of(

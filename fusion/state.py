@@ -33,7 +33,7 @@ ERROR_SIZE = 16
 """States that are always there."""
 
 RING_SIZE = 2048
-"""IMU samples kept to see whether the vehicle stands still."""
+"""IMU samples kept to see whether the vehicle stands still; a power of two."""
 
 
 ROW = ERROR_SIZE
@@ -76,13 +76,15 @@ class Core(NamedTuple):
     nav (n + 1,); P (n, n); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
     span (1,): seconds since P was propagated; acc (15, 3): the transition over them (A_*).
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
-    ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
+    ring (N, 6), ring_t (N,): latest IMU samples, N = RING_SIZE or a greater power of two.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
     aged (3,): seconds since the lasting error of GNSS was moved on, metres since that of pose fixes was, and the
     horizontal variance that the last GNSS position stated.
     doubt (2, 8), doubt_clock (2, 5) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
     phi (9, 16), M (9, n), Mt (16, 16), H, W (3, n), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (n,): scratch.
+    rate (3,): the body rate before the last sample, as events at its time saw it, rad/s.
+    kept (K,), saved (S, K), saved_cov (S, n, n), saved_t (S, 2), saves (4,): ``fusion.snapshots``; S = 0: none.
     """
 
     clock: Nanoseconds
@@ -108,6 +110,12 @@ class Core(NamedTuple):
     eigen: Floats
     residual: Floats
     dx: Floats
+    rate: Floats
+    kept: Nanoseconds
+    saved: Nanoseconds
+    saved_cov: Floats
+    saved_t: Nanoseconds
+    saves: Nanoseconds
 
 
 def new_core(size: int = ERROR_SIZE) -> Core:
@@ -136,4 +144,10 @@ def new_core(size: int = ERROR_SIZE) -> Core:
         eigen=np.zeros((2, 3, 3)),
         residual=np.zeros(3),
         dx=np.zeros(size),
+        rate=np.zeros(3),
+        kept=np.zeros(0, np.int64),
+        saved=np.zeros((0, 0), np.int64),
+        saved_cov=np.zeros((0, ERROR_SIZE, ERROR_SIZE)),
+        saved_t=np.zeros((0, 2), np.int64),
+        saves=np.zeros(4, np.int64),
     )

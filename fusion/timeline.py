@@ -100,11 +100,19 @@ def _vector(given: tuple[float, float, float]) -> tuple[float, float, float]:
     return float(given[0]), float(given[1]), float(given[2])
 
 
-def grid(first_ns: int, last_ns: int, rate_hz: float) -> NDArray[np.int64]:
-    """Multiples of the period in [first, last], ns."""
-    period = round(1e9 / rate_hz)
+def grid(first_ns: int, last_ns: int, period: int) -> NDArray[np.int64]:
+    """Multiples of the period in [first, last], ns; of period 0 there are none."""
+    if period == 0:
+        return np.empty(0, np.int64)
     start = -(-first_ns // period)
     return np.arange(start, last_ns // period + 1, dtype=np.int64) * period
+
+
+def periods(config: FusionConfig, land_vehicle: bool) -> tuple[int, int]:
+    """Of outputs and of motion ticks, ns (0: there are none)."""
+    motion = config.motion
+    wanted = land_vehicle and (motion.zero_velocity or motion.non_holonomic)
+    return round(1e9 / config.output_hz), round(1e9 / motion.rate_hz) if wanted else 0
 
 
 class Timeline(NamedTuple):
@@ -120,10 +128,7 @@ def merge(found: Sources, first_ns: int, last_ns: int, config: FusionConfig, lan
 
     At equal times sensors come in the order of ``Sensor``, then motion, then output.
     """
-    outputs = grid(first_ns, last_ns, config.output_hz)
-    motion = config.motion
-    wanted = land_vehicle and (motion.zero_velocity or motion.non_holonomic)
-    ticks = grid(first_ns, last_ns, motion.rate_hz) if wanted else outputs[:0]
+    outputs, ticks = (grid(first_ns, last_ns, period) for period in periods(config, land_vehicle))
     made = np.concatenate((np.full(len(ticks), MOTION, np.int8), np.full(len(outputs), OUTPUT, np.int8)))
     none = np.full(len(made), -1)
     t = np.concatenate((found.t_ns, ticks, outputs))

@@ -84,7 +84,7 @@ class Drive:
         assert start_ns is not None
         hide = self.config.hide_gnss
         return {
-            "order": "stamp",
+            "order": self.config.fusion.order,
             "period_ns": self.period_ns,
             "start_ns": start_ns,
             "alignment_s": None if self._aligned_ns is None else (self._aligned_ns - start_ns) / NS_PER_S,

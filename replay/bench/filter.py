@@ -1,5 +1,7 @@
 """`egoloc bench filter`: IMU steps per second of the whole filter, beside filterpy, gtsam and pyins in the same run.
 
+In stamp order and, by turns, in arrival order: positions come 50 ms late, pose fixes 120 ms, wheel speeds 10 ms.
+
 One simulated drive: 100 Hz IMU, 10 Hz GNSS positions, 10 Hz pose fixes. egoloc's figures are whole calls of
 ``fusion.run`` (covariances, sorting, alignment, gates, recording included) over all of it. The peers get less to do,
 over its first minutes: arrays ready in one plane before the clock starts, a first state, fixes that share their stamps,
@@ -7,6 +9,7 @@ and no gates or records to keep; filterpy and gtsam also a flat earth. They have
 scale); tests hold all of them to the truth.
 """
 
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
@@ -14,11 +17,13 @@ from importlib.util import find_spec
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from fusion.config import FusionConfig, MotionModel
 from fusion.run import run as fuse
-from replay.bench.measure import conditions, rate, times
+from replay.bench.measure import conditions, rate, row, times
 from replay.bench.peers import peer_drive
+from sensors.records import Log
 from sensors.simulate.drive import simulate_drive
 from sensors.simulate.scenarios import load
 
@@ -37,16 +42,14 @@ def run(repeats: int = 5, seconds: float = 1800.0, peer_steps: Mapping[str, int]
     scenario = load("clean")
     whole = simulate_drive(seconds, scenario.seed, scenario).log
     log = replace(whole, gnss_velocity=None, wheel=None, reference=None)
-    assert log.imu is not None
     plain = msgspec.structs.replace(FusionConfig(), motion=MotionModel(zero_velocity=False, non_holonomic=False))
-    steps = len(log.imu)
     rows = [
-        rate("egoloc", METRIC, steps, times(lambda: fuse(log, plain), repeats)),
-        rate("egoloc, all sensors and constraints", METRIC, steps, times(lambda: fuse(whole), repeats)),
+        *_both_orders("egoloc", log, plain, repeats),
+        *_both_orders("egoloc, all sensors and constraints", whole, FusionConfig(), repeats),
     ]
     present = [peer for peer in peer_steps if find_spec(peer) is not None]
     rows += [_peer(peer, peer_steps[peer], seconds, min(repeats, 3)) for peer in present]
-    median = {row["name"]: row["median"] for row in rows}
+    median = {line["name"]: line["median"] for line in rows if line["metric"] == METRIC}
     facts = {
         "seconds": seconds,
         "imu_hz": 100,
@@ -60,6 +63,38 @@ def run(repeats: int = 5, seconds: float = 1800.0, peer_steps: Mapping[str, int]
     packages = ["numba", "numpy", *(name for peer in present for name in _PACKAGES.get(peer, (peer,)))]
     ratios = {peer: median["egoloc"] / median[peer] for peer in present}
     return {"bench": "filter", "rows": rows, "ratios": ratios, "conditions": conditions(packages, **facts)}
+
+
+def _both_orders(name: str, log: Log, config: FusionConfig, repeats: int) -> list[dict[str, Any]]:
+    """Rows of stamp order and of arrival order, called by turns, and what the second costs over its share of work."""
+    assert log.imu is not None
+    orders = {order: msgspec.structs.replace(config, order=order) for order in ("stamp", "arrival")}
+    spent: dict[str, list[float]] = {order: [] for order in orders}
+    for counted in range(repeats + 1):  # the first call warms up
+        for order, chosen in orders.items():
+            start = time.perf_counter()
+            fuse(log, chosen)
+            if counted:
+                spent[order].append(time.perf_counter() - start)
+    cost = np.divide(spent["arrival"], spent["stamp"])
+    return [
+        rate(name, METRIC, len(log.imu), spent["stamp"]),
+        rate(f"{name}, arrival order", METRIC, len(log.imu), spent["arrival"]),
+        row(f"{name}, arrival order", "cost_over_stamp_order", cost.tolist()),
+        row(f"{name}, arrival order", "cost_over_work", (cost / work_by_arrival(log)).tolist()),
+    ]
+
+
+def work_by_arrival(log: Log) -> float:
+    """IMU steps per IMU sample where each late arrival repeats those since its stamp: 1 + sum of rate x latency.
+
+    GNSS positions and velocities arrive together and share a rewind.
+    """
+    assert log.imu is not None
+    seconds = (log.imu.t_ns[-1] - log.imu.t_ns[0]) * 1e-9
+    late = [record for record in (log.gnss, log.pose_fixes, log.wheel) if record is not None]
+    waited = sum(float((record.arrival_ns - record.t_ns).sum()) * 1e-9 for record in late)
+    return 1.0 + waited / float(seconds)
 
 
 def _peer(peer: str, steps: int, seconds: float, repeats: int) -> dict[str, Any]:

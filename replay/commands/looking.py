@@ -51,12 +51,12 @@ class View:
 class Bench:
     """Measure speed side by side with other libraries, in one run on one core."""
 
-    name: tyro.conf.Positional[Literal["filter", "replay", "mcap"]]
-    """filter: IMU steps/s of the filter; replay: an hour of log to metrics.json; mcap: IMU messages/s read."""
+    name: tyro.conf.Positional[Literal["filter", "live", "replay", "mcap"]]
+    """filter: IMU steps/s; live: time of a push; replay: an hour of log to metrics.json; mcap: IMU messages/s read."""
     repeats: int = 5
     """Timed calls of each row, after one that warms up; the median counts."""
     hours: tuple[float, ...] = (1.0,)
-    """Lengths of the log, h (replay only): figures of each and how the time grows."""
+    """Lengths of the log, h (replay: figures of each and how the time grows; live: the first)."""
     json: bool = False
     """Print JSON."""
 
@@ -64,7 +64,7 @@ class Bench:
         """Run one benchmark."""
         from replay.bench.measure import one_core
 
-        options = {"hours": self.hours} if self.name == "replay" else {}
+        options = {"hours": self.hours} if self.name in ("replay", "live") else {}
         with stage(f"benchmark {self.name}"), one_core():
             result = import_module(f"replay.bench.{self.name}").run(repeats=self.repeats, **options)
         if self.json:

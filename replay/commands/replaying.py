@@ -47,6 +47,10 @@ class Replay:
         str | None, tyro.conf.arg(metavar="EVERY:LENGTH", help_behavior_hint="(default: hide nothing)")
     ] = None
     """Hide GNSS for LENGTH s every EVERY s, as in 60:15, and score against the RTK-fixed fixes that were hidden."""
+    order: Annotated[
+        Literal["stamp", "arrival"] | None, tyro.conf.arg(help_behavior_hint="(default: the config's, else stamp)")
+    ] = None
+    """Measurements by when they were true, or as they came: late ones by rewinding, states as they were known then."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
     """Logs replayed at a time, each in a process of its own."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")] = None
@@ -93,6 +97,9 @@ class Replay:
         config = RunConfig() if self.config is None else load_config(self.config)
         if self.limits is not None:
             config = msgspec.structs.replace(config, limits=named_limits(self.limits))
+        if self.order is not None:
+            fusion = msgspec.structs.replace(config.fusion, order=self.order)
+            config = msgspec.structs.replace(config, fusion=fusion)
         if self.hide_gnss is not None:
             config = msgspec.structs.replace(config, hide_gnss=parse_hide_gnss(self.hide_gnss))
         if self.reference is not None and config.hide_gnss is not None:
