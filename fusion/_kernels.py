@@ -13,10 +13,13 @@ from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Reco
 from fusion.gating import correct, innovate, observed_directions, whiten
 from fusion.measurements import gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
+from fusion.modes import observed_without
 from fusion.motion import clear, motion
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
+from fusion.robust import reweigh
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, Core, Floats
+from fusion.streak import tally, threshold_of
 from sensors._kernels import radii
 from sensors.kernel import kernel
 
@@ -29,6 +32,8 @@ _PARTLY = int(Reason.PARTLY_ACCEPTED)
 _CHI_SQUARE = int(Reason.CHI_SQUARE)
 _COVARIANCE = int(Reason.COVARIANCE)
 _RECEIVER = int(Reason.RECEIVER)
+_MODES_AGREE = int(Reason.MODES_AGREE)
+_MULTI_MODAL = int(Reason.MULTI_MODAL)
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
@@ -194,17 +199,21 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
         _record(rec, e, kind, 0, _RECEIVER)
         return
     else:
-        dof = _measure(core, par, m, kind, ev.row[e], rate)
+        dof, accepted = _measure(core, par, m, kind, ev.row[e], rate)
         if dof == 0:
-            _record(rec, e, kind, 0, _COVARIANCE)
+            _record(rec, e, kind, 0, accepted)
             return
-        if kind == _POSE_FIX and dof < 3:
-            accepted = _PARTLY
     k = _record(rec, e, kind, dof, _CHI_SQUARE)
-    passed = _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
-    if kind in (_GNSS_POSITION, _POSE_FIX) and dof == 3:
+    if kind not in (_GNSS_POSITION, _POSE_FIX):
+        _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
+        return
+    which = int(kind == _POSE_FIX)
+    passed = _apply(core, rec, par, k, dof, threshold_of(core, par, which, dof, ev.t[e]), accepted)
+    if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
+        tally(core, which, passed, ev.t[e])
+    if dof == 3:
         if passed:
-            believed(core, int(kind == _POSE_FIX))
+            believed(core, which)
         elif kind == _POSE_FIX:
             doubted(core, par, 1, _triple(rec.innovation, k), heading(attitude(core.nav)), ev.t[e])
         else:
@@ -224,17 +233,19 @@ def _copy(cov: Floats, row: int, R: Floats) -> None:
 
 
 @kernel(inline="always")
-def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector) -> int:
-    """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom."""
+def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector) -> tuple[int, int]:
+    """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom, and the Reason to
+    record if it is applied, or why it cannot be where there are none."""
     nav, H, R = core.nav, core.H, core.R
     clear(H)
     r = attitude(nav)
     if kind == _POSE_FIX:
-        dof: int = _measure_pose(core, par, m, row)
-        return dof
+        observed: tuple[int, int] = _measure_pose(core, par, m, row)
+        return observed
     if kind == _GNSS_POSITION:
         _copy(m.gnss_cov, row, R)
         z = gnss_position(nav, r, H, _triple(m.gnss_llh, row), par.gnss_arm)
+        _hold(core.fresh, z[0], z[1], m.gnss_cov, row)
     elif kind == _GNSS_VELOCITY:
         _copy(m.vel_cov, row, R)
         z = gnss_velocity(nav, r, H, _triple(m.vel, row), par.gnss_arm, rate)
@@ -245,11 +256,18 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
         R[0, 0] = m.wheel_var[row]
         z = (wheel_speed(nav, r, H, m.wheel[row], par.axle, rate), 0.0, 0.0)
     core.residual[0], core.residual[1], core.residual[2] = z
-    return 3 if kind in (_GNSS_POSITION, _GNSS_VELOCITY) else 1
+    return 3 if kind in (_GNSS_POSITION, _GNSS_VELOCITY) else 1, _ACCEPTED
+
+
+@kernel()
+def _hold(fresh: Floats, east: float, north: float, cov: Floats, row: int) -> None:
+    """Remember the horizontal innovation of the position being judged, and its R."""
+    fresh[0], fresh[1] = east, north
+    fresh[2], fresh[3], fresh[4] = cov[row, 0, 0], cov[row, 0, 1], cov[row, 1, 1]
 
 
 @kernel(inline="always")
-def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int:
+def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> tuple[int, int]:
     """Pose fix in vehicle axes; directions that the histogram does not observe are dropped."""
     R, nav, cov = core.R, core.nav, m.pose_cov
     r = attitude(nav)
@@ -257,6 +275,7 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int
     tilt = (m.pose_tilt[row, 0], m.pose_tilt[row, 1])
     z = pose_fix(r, core.H, nav, _triple(m.pose_llh, row), m.pose_yaw[row], tilt, par.pose_arm, (c, s))
     core.residual[0], core.residual[1], core.residual[2] = z
+    _hold(core.fresh, c * z[0] - s * z[1], s * z[0] + c * z[1], cov, row)
     ee, en, nn = cov[row, 0, 0], cov[row, 0, 1], cov[row, 1, 1]
     ey, ny = cov[row, 0, 2], cov[row, 1, 2]
     R[0, 0] = c * c * ee + 2.0 * c * s * en + s * s * nn
@@ -268,17 +287,25 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> int
     limits = par.pose_limits
     trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
     if trace <= 1.0:  # then every eigenvalue is
-        return 3
-    kept: int = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
-    return kept
+        return 3, _ACCEPTED
+    a, b, turn = m.pose_spread[row, 0], m.pose_spread[row, 1], m.pose_spread[row, 2]
+    alone = 0  # directions that are observed if there is one mode only
+    if a != 0.0 or b != 0.0 or turn != 0.0:
+        alone = observed_without(R, (c * a + s * b, c * b - s * a, turn), limits, core.eigen)
+    kept = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
+    if kept == 3:
+        return 3, _ACCEPTED
+    if kept == 0 or not par.pose_partial:
+        return 0, _MULTI_MODAL if kept < alone else _COVARIANCE
+    return kept, _MODES_AGREE if kept < alone else _PARTLY
 
 
 @kernel(inline="always")
-def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accepted: int) -> bool:
+def _apply(core: Core, rec: Recorder, par: Parameters, k: int, dof: int, threshold: float, accepted: int) -> bool:
     """Gate the core's residual and correct the state; complete decision k. Whether it passed."""
     L, residual = core.L, core.residual
     rec.scores[k, 1] = threshold
-    rec.scores[k, 2] = rec.scores[k, 3] = 0.0
+    rec.scores[k, 2] = rec.scores[k, 3] = rec.scores[k, 4] = 0.0
     for i in range(dof):
         rec.innovation[k, i] = residual[i]
     if not innovate(core.P, core.H, core.W, dof, core.R, L):
@@ -292,11 +319,17 @@ def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accept
     rec.scores[k, 0] = score
     if not score <= threshold:
         return False
+    weight = 1.0
+    if par.robust:
+        weight = reweigh(
+            core.P, core.H, core.W, dof, core.R, L, residual, rec.innovation, k, par.robust, par.robust_sigmas, core.dx
+        )  # fmt: skip
     correct(core.nav, core.earth, core.P, core.W, core.dx, residual, dof)
     dx = core.dx
     rec.reason[k] = accepted
     rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
     rec.scores[k, 3] = abs(dx[8])
+    rec.scores[k, 4] = weight
     return True
 
 
@@ -308,7 +341,7 @@ def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> in
     rec.event[k], rec.sensor[k], rec.dof[k], rec.reason[k] = event, sensor, dof, reason
     for i in range(3):
         rec.innovation[k, i] = rec.sigma[k, i] = np.nan
-    for i in range(4):
+    for i in range(5):
         rec.scores[k, i] = np.nan
     return k
 

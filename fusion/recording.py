@@ -50,6 +50,7 @@ def decisions(rec: Recorder, timeline: Timeline) -> Decisions:
         rec.dof[:n],
         scores[:, 2],
         scores[:, 3],
+        scores[:, 4],
     )
 
 
@@ -72,6 +73,7 @@ def unused(found: Sources, reason: Reason, initial: Initial | None = None) -> De
         nothing,
         nothing,
         np.zeros(n, np.int8),
+        nothing,
         nothing,
         nothing,
     )

@@ -56,7 +56,7 @@ ACC_SIZE = 14
 G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8)
 
 # entries of Core.doubt_clock
-D_COUNT, D_TIME, D_AGREED = range(3)
+D_COUNT, D_TIME, D_AGREED, D_STREAK, D_LAST, D_TRACKING, D_HELD = range(7)
 
 # entries of Core.clock
 C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)
@@ -72,7 +72,8 @@ class Core(NamedTuple):
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
-    doubt (2, 8), doubt_clock (2, 3) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
+    doubt (2, 13), doubt_clock (2, 7) int64: the last rejected GNSS position and pose fix (``fusion.recovery``,
+    ``fusion.streak``); fresh (5,): the position that is being judged: innovation east, north m and its R's ee, en, nn.
     phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
     """
@@ -89,6 +90,7 @@ class Core(NamedTuple):
     quietest: Floats
     doubt: Floats
     doubt_clock: Nanoseconds
+    fresh: Floats
     phi: Floats
     M: Floats
     Mt: Floats
@@ -114,8 +116,9 @@ def new_core() -> Core:
         ring=np.zeros((RING_SIZE, 6)),
         ring_t=np.zeros(RING_SIZE, np.int64),
         quietest=np.full(2, np.inf),
-        doubt=np.zeros((2, 8)),
-        doubt_clock=np.zeros((2, 3), np.int64),
+        doubt=np.zeros((2, 13)),
+        doubt_clock=np.zeros((2, 7), np.int64),
+        fresh=np.zeros(5),
         phi=np.zeros((9, ROW)),
         M=np.zeros((9, ROW)),
         Mt=np.zeros((ERROR_SIZE, ROW)),
