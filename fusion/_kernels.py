@@ -208,7 +208,8 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
         _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
         return
     which = int(kind == _POSE_FIX)
-    passed = _apply(core, rec, par, k, dof, threshold_of(core, par, which, dof, ev.t[e]), accepted)
+    threshold = threshold_of(core, par, dof, ev.t[e]) if which else par.gate[dof - 1]
+    passed = _apply(core, rec, par, k, dof, threshold, accepted)
     if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
         tally(core, which, passed, ev.t[e])
     if dof == 3:
@@ -245,7 +246,6 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
     if kind == _GNSS_POSITION:
         _copy(m.gnss_cov, row, R)
         z = gnss_position(nav, r, H, _triple(m.gnss_llh, row), par.gnss_arm)
-        _hold(core.fresh, z[0], z[1], m.gnss_cov, row)
     elif kind == _GNSS_VELOCITY:
         _copy(m.vel_cov, row, R)
         z = gnss_velocity(nav, r, H, _triple(m.vel, row), par.gnss_arm, rate)
@@ -259,13 +259,6 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
     return 3 if kind in (_GNSS_POSITION, _GNSS_VELOCITY) else 1, _ACCEPTED
 
 
-@kernel()
-def _hold(fresh: Floats, east: float, north: float, cov: Floats, row: int) -> None:
-    """Remember the horizontal innovation of the position being judged, and its R."""
-    fresh[0], fresh[1] = east, north
-    fresh[2], fresh[3], fresh[4] = cov[row, 0, 0], cov[row, 0, 1], cov[row, 1, 1]
-
-
 @kernel(inline="always")
 def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> tuple[int, int]:
     """Pose fix in vehicle axes; directions that the histogram does not observe are dropped."""
@@ -275,8 +268,9 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> tup
     tilt = (m.pose_tilt[row, 0], m.pose_tilt[row, 1])
     z = pose_fix(r, core.H, nav, _triple(m.pose_llh, row), m.pose_yaw[row], tilt, par.pose_arm, (c, s))
     core.residual[0], core.residual[1], core.residual[2] = z
-    _hold(core.fresh, c * z[0] - s * z[1], s * z[0] + c * z[1], cov, row)
     ee, en, nn = cov[row, 0, 0], cov[row, 0, 1], cov[row, 1, 1]
+    fresh = core.fresh
+    fresh[0], fresh[1], fresh[2], fresh[3], fresh[4] = c * z[0] - s * z[1], s * z[0] + c * z[1], ee, en, nn
     ey, ny = cov[row, 0, 2], cov[row, 1, 2]
     R[0, 0] = c * c * ee + 2.0 * c * s * en + s * s * nn
     R[1, 1] = s * s * ee - 2.0 * c * s * en + c * c * nn

@@ -138,8 +138,8 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     outvoted: Annotated[int, msgspec.Meta(ge=1)] = 20
     """So many GNSS positions and pose fixes, rejected in a row while they agree, outvote the state, -."""
     streak: Annotated[int, msgspec.Meta(ge=1)] = 10
-    """After so many positions of a sensor that were rejected in a row and say the same, its next one like them passes
-    only where it is explained well, -."""
+    """After so many pose fixes that were rejected in a row and say the same, the next one like them must be explained
+    well, -."""
     reentry: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.5
     """How well: this share of correct measurements has an innovation as small, -."""
     robust: Literal["none", "huber", "cauchy"] = "none"

@@ -29,9 +29,9 @@ class Parameters(NamedTuple):
     outvoted: int
     """So many agreeing rejections of GNSS positions and pose fixes outvote the state."""
     streak: int
-    """So many rejections of a sensor that say the same are a streak."""
+    """So many rejected pose fixes that say the same are a streak."""
     reentry: Vector
-    """Thresholds for a position that goes on with a streak."""
+    """Thresholds for a pose fix that goes on with a streak."""
     robust: int
     """Robust kernel: its place in config.KERNELS."""
     robust_sigmas: float

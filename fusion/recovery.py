@@ -76,7 +76,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     if clock[0, D_AGREED] >= par.outvoted:
         _give_way(core.P, doubt)
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
-        clock[0, D_STREAK] = clock[1, D_STREAK] = 0
+        clock[1, D_STREAK] = 0
 
 
 @kernel()

@@ -1,7 +1,7 @@
 """Robust kernels: a measurement that lies far out, within its gate, counts less.
 
 M-estimation of the update by iterated reweighting (Huber 1981, ch. 7; Zhang 1997): minimize dx' P^-1 dx plus
-twice rho(|R^-1/2 (z - H dx)|), where the weight psi(r) / r of the residual r that a solution leaves divides R in the next.
+twice rho(|R^-1/2 (z - H dx)|), where the weight psi(r) / r of the residual r of one solution divides R in the next.
 """
 
 import math

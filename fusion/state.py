@@ -73,7 +73,7 @@ class Core(NamedTuple):
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
     doubt (2, 13), doubt_clock (2, 7) int64: the last rejected GNSS position and pose fix (``fusion.recovery``,
-    ``fusion.streak``); fresh (5,): the position that is being judged: innovation east, north m and its R's ee, en, nn.
+    ``fusion.streak``); fresh (5,): the pose fix that is being judged: innovation east, north m and its R's ee, en, nn.
     phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
     """
