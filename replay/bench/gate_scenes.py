@@ -223,9 +223,9 @@ def _moved(drive: Drive, fixes: PoseFix, off: Floats, told: float | None = None)
     moved = replace(fixes, pose=pose)
     if told is None:
         return moved
-    wrong = off.any(axis=1)
-    modes = np.where(wrong[:, None, None], np.stack((pose, fixes.pose), axis=1), np.nan)
-    return replace(moved, modes=modes, weights=np.where(wrong[:, None], [told, 1.0 - told], 0.0))
+    wrong = np.any(off != 0.0, axis=1, keepdims=True)
+    modes = np.where(wrong[:, :, None], np.stack((pose, fixes.pose), axis=1), np.nan)
+    return replace(moved, modes=modes, weights=np.where(wrong, [told, 1.0 - told], 0.0))
 
 
 def _fed_back(log: Log, blind: Mask, noise: Floats, method: Method) -> Log:
