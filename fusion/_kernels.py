@@ -14,14 +14,16 @@ from fusion.blocks import arm_of, fade, lasting, renew, scale, see_arm, see_dela
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import AGAIN, MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
-from fusion.layout import OFF, Layout
 from fusion.measurements import Pair, gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
+from fusion.modes import observed_without
 from fusion.motion import clear, motion
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
+from fusion.robust import reweigh
 from fusion.snapshots import S_CHANGED, save
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, ROW, Core, Floats
+from fusion.streak import tally, threshold_of
 from sensors._kernels import radii
 from sensors.kernel import kernel
 
@@ -34,6 +36,8 @@ _PARTLY = int(Reason.PARTLY_ACCEPTED)
 _CHI_SQUARE = int(Reason.CHI_SQUARE)
 _COVARIANCE = int(Reason.COVARIANCE)
 _RECEIVER = int(Reason.RECEIVER)
+_MODES_AGREE = int(Reason.MODES_AGREE)
+_MULTI_MODAL = int(Reason.MULTI_MODAL)
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
@@ -224,37 +228,34 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
         _record(rec, e, kind, 0, _RECEIVER)
         return
     else:
-        dof = _measure(core, par, m, kind, ev.row[e], rate, True)
+        dof, accepted = _measure(core, par, m, kind, ev.row[e], rate, True)
         if dof == 0:
-            _record(rec, e, kind, 0, _COVARIANCE)
+            _record(rec, e, kind, 0, accepted)
             return
-        if kind == _POSE_FIX and dof < 3:
-            accepted = _PARTLY
     k = _record(rec, e, kind, dof, _CHI_SQUARE)
-    passed = _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
-    first = _lasting_of(par.layout, kind)
+    if kind not in (_GNSS_POSITION, _POSE_FIX):
+        _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
+        return
+    which = int(kind == _POSE_FIX)
+    threshold = threshold_of(core, par, dof, ev.t[e]) if which else par.gate[dof - 1]
+    passed = _apply(core, rec, par, k, dof, threshold, accepted)
+    first = par.layout.pose_error if which else par.layout.gnss_error
     if not passed and first >= 0:  # what lasted may have changed all at once: then the state need not move for it
-        dof = _measure(core, par, m, kind, ev.row[e], rate, False)
+        dof, accepted = _measure(core, par, m, kind, ev.row[e], rate, False)
         known = innovate(core.P, core.H, core.W, dof, core.R, core.L)
-        if known and whiten(dof, core.residual, core.L) <= par.gate[dof - 1]:
+        if known and whiten(dof, core.residual, core.L) <= threshold:
             renew(core.nav, core.P, first)
-            dof = _measure(core, par, m, kind, ev.row[e], rate, True)
-            passed = _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
-    if kind in (_GNSS_POSITION, _POSE_FIX) and dof == 3:
+            dof, accepted = _measure(core, par, m, kind, ev.row[e], rate, True)
+            passed = _apply(core, rec, par, k, dof, threshold, accepted)
+    if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
+        tally(core, which, passed, ev.t[e])
+    if dof == 3:
         if passed:
-            believed(core, int(kind == _POSE_FIX), ev.t[e])
+            believed(core, which, ev.t[e])
         elif kind == _POSE_FIX:
             doubted(core, par, 1, _triple(rec.innovation, k), heading(attitude(core.nav)), ev.t[e])
         else:
             doubted(core, par, 0, _triple(rec.innovation, k), (1.0, 0.0), ev.t[e])
-
-
-@kernel(inline="always")
-def _lasting_of(layout: Layout, kind: int) -> int:
-    """Where the lasting errors of a sensor stand, -1: nowhere."""
-    if kind == _GNSS_POSITION:
-        return layout.gnss_error
-    return layout.pose_error if kind == _POSE_FIX else OFF
 
 
 @kernel()
@@ -270,8 +271,11 @@ def _copy(cov: Floats, row: int, R: Floats) -> None:
 
 
 @kernel(inline="always")
-def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector, lasts: bool) -> int:
-    """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom.
+def _measure(
+    core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector, lasts: bool
+) -> tuple[int, int]:
+    """Write residual, H and R of a sensor's measurement into the core; return its degrees of freedom, and the Reason to
+    record if it is applied, or why it cannot be where there are none.
 
     lasts: let the states of errors that last carry their share of R; else R is whole, and they are not seen.
     """
@@ -279,8 +283,8 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
     clear(H)
     r = attitude(nav)
     if kind == _POSE_FIX:
-        dof: int = _measure_pose(core, par, m, row, rate, lasts)
-        return dof
+        observed: tuple[int, int] = _measure_pose(core, par, m, row, rate, lasts)
+        return observed
     arm = arm_of(nav, par.layout, par.gnss_arm)
     if kind == _GNSS_POSITION:
         _copy(m.gnss_cov, row, R)
@@ -298,10 +302,10 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
         z = (wheel_speed(nav, r, H, m.wheel[row], par.axle, rate), 0.0, 0.0)
     core.residual[0], core.residual[1], core.residual[2] = z
     if kind not in (_GNSS_POSITION, _GNSS_VELOCITY):
-        return 1
+        return 1, _ACCEPTED
     if H.shape[1] > ROW:
         _see_receiver(core, par, r, kind == _GNSS_VELOCITY, rate, lasts)
-    return 3
+    return 3, _ACCEPTED
 
 
 @kernel(inline="always")
@@ -330,7 +334,7 @@ def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rat
 
 
 @kernel(inline="always")
-def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: Vector, lasts: bool) -> int:
+def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: Vector, lasts: bool) -> tuple[int, int]:
     """Pose fix in vehicle axes; directions that the histogram does not observe are dropped; rate: body, rad/s."""
     R, nav, cov = core.R, core.nav, m.pose_cov
     r = attitude(nav)
@@ -339,6 +343,8 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
     z = pose_fix(r, core.H, nav, _triple(m.pose_llh, row), m.pose_yaw[row], tilt, par.pose_arm, (c, s))
     core.residual[0], core.residual[1], core.residual[2] = z
     ee, en, nn = cov[row, 0, 0], cov[row, 0, 1], cov[row, 1, 1]
+    fresh = core.fresh
+    fresh[0], fresh[1], fresh[2], fresh[3], fresh[4] = c * z[0] - s * z[1], s * z[0] + c * z[1], ee, en, nn
     ey, ny = cov[row, 0, 2], cov[row, 1, 2]
     R[0, 0] = c * c * ee + 2.0 * c * s * en + s * s * nn
     R[1, 1] = s * s * ee - 2.0 * c * s * en + c * c * nn
@@ -348,14 +354,22 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
     R[2, 2] = cov[row, 2, 2]
     limits = par.pose_limits
     trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
+    a, b, turn = m.pose_spread[row, 0], m.pose_spread[row, 1], m.pose_spread[row, 2]
+    alone = 0  # directions that are observed if there is one mode only
+    if trace > 1.0 and (a != 0.0 or b != 0.0 or turn != 0.0):
+        alone = observed_without(R, (c * a + s * b, c * b - s * a, turn), limits, core.eigen)
     _see_matching(core, par, (c, s), r[8] * rate[2], lasts)
     if trace <= 1.0:  # then every eigenvalue is
-        return 3
+        return 3, _ACCEPTED
     if par.layout.pose_error >= 0:  # R has been scaled
         grown = math.sqrt(par.pose_shares[0] + (0.0 if lasts else par.pose_shares[1]))
         limits = (grown * limits[0], grown * limits[1], grown * limits[2])
-    kept: int = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
-    return kept
+    kept = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
+    if kept == 3:
+        return 3, _ACCEPTED
+    if kept == 0 or not par.pose_partial:
+        return 0, _MULTI_MODAL if kept < alone else _COVARIANCE
+    return kept, _MODES_AGREE if kept < alone else _PARTLY
 
 
 @kernel(inline="always")
@@ -379,11 +393,11 @@ def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float, las
 
 
 @kernel(inline="always")
-def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accepted: int) -> bool:
+def _apply(core: Core, rec: Recorder, par: Parameters, k: int, dof: int, threshold: float, accepted: int) -> bool:
     """Gate the core's residual and correct the state; complete decision k. Whether it passed."""
     L, residual = core.L, core.residual
     rec.scores[k, 1] = threshold
-    rec.scores[k, 2] = rec.scores[k, 3] = 0.0
+    rec.scores[k, 2] = rec.scores[k, 3] = rec.scores[k, 4] = 0.0
     for i in range(dof):
         rec.innovation[k, i] = residual[i]
     if not innovate(core.P, core.H, core.W, dof, core.R, L):
@@ -397,11 +411,17 @@ def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accept
     rec.scores[k, 0] = score
     if not score <= threshold:
         return False
+    weight = 1.0
+    if par.robust:
+        weight = reweigh(
+            core.P, core.H, core.W, dof, core.R, L, residual, rec.innovation, k, par.robust, par.robust_sigmas, core.dx
+        )  # fmt: skip
     correct(core.nav, core.earth, core.P, core.W, core.dx, residual, dof)
     dx = core.dx
     rec.reason[k] = accepted
     rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
     rec.scores[k, 3] = abs(dx[8])
+    rec.scores[k, 4] = weight
     return True
 
 
@@ -413,7 +433,7 @@ def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> in
     rec.event[k], rec.sensor[k], rec.dof[k], rec.reason[k] = event, sensor, dof, reason
     for i in range(3):
         rec.innovation[k, i] = rec.sigma[k, i] = np.nan
-    for i in range(4):
+    for i in range(5):
         rec.scores[k, i] = np.nan
     return k
 

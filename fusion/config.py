@@ -9,7 +9,8 @@ from sensors.bounds import NonNegative, Positive, RateHz
 from sensors.errors import EgolocError
 
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-
+KERNELS = ("none", "huber", "cauchy")
+"""Robust kernels."""
 _NOT_ZERO = {
     "white_share",
     "lasting_s",
@@ -25,6 +26,7 @@ _NOT_ZERO = {
     "max_sigma_longitudinal_m",
     "max_sigma_lateral_m",
     "max_sigma_yaw_deg",
+    "robust_sigmas",
 }
 
 LONGEST_HISTORY_S = 10.0
@@ -95,13 +97,21 @@ class PoseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Smallest sigma along any direction of the plane, m."""
     sigma_floor_yaw_deg: NonNegative = 0.05
     """Smallest sigma of yaw, deg."""
+    step_m: NonNegative = 0.0
+    """Step of the finest lattice of a matcher whose fixes are not calibrated: step^2/12 adds to their variances, m."""
+    step_deg: NonNegative = 0.0
+    """The same, yaw, deg."""
     max_sigma_longitudinal_m: Positive = 0.33
-    """Covariance gate: a direction with more than this is not observed by the histogram (half the variance of a flat
-    window at the finest level), and dropped, m."""
+    """Covariance gate: a direction that the fix knows no better than this (half a flat window's variance at the finest
+    level) is not observed, and dropped, m."""
     max_sigma_lateral_m: Positive = 0.33
     """The same, lateral, m."""
     max_sigma_yaw_deg: Positive = 0.33
     """The same, yaw, deg."""
+    partial: bool = True
+    """Use the observed directions of a fix where others are not; else such a fix is rejected whole."""
+    modes: bool = True
+    """Where a fix tells two modes of its posterior, use only what they agree on."""
 
 
 class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -165,7 +175,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Chi-square gate on innovations."""
+    """Chi-square gate on innovations, and how much counts what passes it."""
 
     probability: Annotated[float, msgspec.Meta(ge=0.5, lt=1.0)] = 0.9999
     """Probability that a correct measurement passes, -."""
@@ -173,6 +183,15 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Gate at all."""
     outvoted: Annotated[int, msgspec.Meta(ge=1)] = 20
     """So many GNSS positions and pose fixes, rejected in a row while they agree, outvote the state, -."""
+    streak: Annotated[int, msgspec.Meta(ge=1)] = 10
+    """After so many pose fixes that were rejected in a row and say the same, the next one like them must be explained
+    well, -."""
+    reentry: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.5
+    """How well: this share of correct measurements has an innovation as small, -."""
+    robust: Literal["none", "huber", "cauchy"] = "none"
+    """Robust kernel on what passes the gate."""
+    robust_sigmas: Positive = 2.0
+    """Residual from which on it takes effect, root mean square over the components, standard deviations."""
 
 
 class Alignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -221,7 +240,12 @@ def check(config: msgspec.Struct, path: str = "fusion") -> None:
                 raise EgolocError(f'config: {key}: expected "stamp" or "arrival", got {value!r}')
         elif name == "history_s" and not 0.0 < value <= LONGEST_HISTORY_S:
             raise EgolocError(f"config: {key}: expected a number above 0 and up to {LONGEST_HISTORY_S:g}, got {value}")
+        elif name == "robust":
+            if value not in KERNELS:
+                raise EgolocError(f"config: {key}: expected {', '.join(KERNELS)}, got {value!r}")
         elif name == "probability" and not 0.5 <= value < 1.0:
             raise EgolocError(f"config: {key}: expected 0.5..1, got {value}")
+        elif name == "reentry" and not 0.0 < value < 1.0:
+            raise EgolocError(f"config: {key}: expected a number between 0 and 1, got {value}")
         elif not 0.0 <= value < math.inf or (value == 0.0 and name in _NOT_ZERO):
             raise EgolocError(f"config: {key}: expected a number above zero, got {value}")

@@ -39,11 +39,20 @@ class Parameters(NamedTuple):
     """Chi-square thresholds for 1, 2 and 3 degrees of freedom."""
     outvoted: int
     """So many agreeing rejections of GNSS positions and pose fixes outvote the state."""
+    streak: int
+    """So many rejected pose fixes that say the same are a streak."""
+    reentry: Vector
+    """Thresholds for a pose fix that goes on with a streak."""
+    robust: int
+    """Robust kernel: its place in config.KERNELS."""
+    robust_sigmas: float
     gnss_arm: Vector
     pose_arm: Vector
     axle: Vector
     pose_limits: Vector
-    """Largest observed sigma along, left and in yaw."""
+    """Largest observed sigma along, left and in yaw, of the inflated covariance."""
+    pose_partial: bool
+    """Use the observed directions where others are not."""
     zero_velocity: bool
     non_holonomic: bool
     wheel_slip: float
@@ -65,7 +74,8 @@ class Measurements(NamedTuple):
     """Columns of each sensor with the covariances that the filter uses (floors and inflation applied).
 
     gnss_llh (N, 3), gnss_cov (N, 3, 3) ENU; vel (N, 3), vel_cov (N, 3, 3); yaw, yaw_var (N,); pose_llh (N, 3),
-    pose_yaw (N,) from east, pose_tilt (N, 2), pose_cov (N, 3, 3) in (east, north, yaw); wheel, wheel_var (N,).
+    pose_yaw (N,) from east, pose_tilt (N, 2), pose_cov (N, 3, 3) in (east, north, yaw), pose_spread (N, 3) the part
+    s s' of it that stands for two modes (``fusion.modes``); wheel, wheel_var (N,).
     """
 
     gnss_llh: Floats
@@ -78,6 +88,7 @@ class Measurements(NamedTuple):
     pose_yaw: Floats
     pose_tilt: Floats
     pose_cov: Floats
+    pose_spread: Floats
     wheel: Floats
     wheel_var: Floats
 
@@ -96,8 +107,8 @@ class Recorder(NamedTuple):
     """Output arrays, filled from ``filled`` = (states, decisions) on; an event met AGAIN needs a row of them to itself.
 
     States: t (N,), nav (N, 16) and sigma_state (N, 15) without the wheel scale, pose_cov (N, 6, 6). Decisions: event
-    (M,) index of the event; sensor, reason, dof (M,) int8; innovation, sigma (M, 3); scores (M, 4): NIS, threshold,
-    metres moved, yaw moved.
+    (M,) index of the event; sensor, reason, dof (M,) int8; innovation, sigma (M, 3); scores (M, 5): NIS, threshold,
+    metres moved, yaw moved, weight.
     """
 
     filled: NDArray[np.int64]
@@ -128,5 +139,5 @@ def new_recorder(states: int, decided: int) -> Recorder:
         dof=np.zeros(decided, np.int8),
         innovation=np.empty((decided, 3)),
         sigma=np.empty((decided, 3)),
-        scores=np.empty((decided, 4)),
+        scores=np.empty((decided, 5)),
     )

@@ -56,6 +56,7 @@ def decided(rec: Recorder, t_ns: Nanoseconds, arrival_ns: Nanoseconds, log_row: 
         rec.dof[:n],
         scores[:, 2],
         scores[:, 3],
+        scores[:, 4],
     )
 
 
@@ -78,6 +79,7 @@ def unused(found: Sources, reason: Reason, initial: Initial | None = None) -> De
         nothing,
         nothing,
         np.zeros(n, np.int8),
+        nothing,
         nothing,
         nothing,
     )

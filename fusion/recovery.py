@@ -11,7 +11,7 @@ import math
 from fusion._linalg import Vector, attitude, matvec
 from fusion.events import Parameters
 from fusion.measurements import Pair
-from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_SINCE, D_TIME, E_WHEEL_SCALE, Core, Floats
+from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_SINCE, D_STREAK, D_TIME, E_WHEEL_SCALE, Core, Floats
 from sensors.kernel import kernel
 
 FRESH_NS = 500_000_000
@@ -96,6 +96,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     if clock[0, D_AGREED] >= par.outvoted:
         _give_way(core.P, doubt)
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
+        clock[1, D_STREAK] = 0
 
 
 @kernel()

@@ -46,6 +46,10 @@ class Reason(IntEnum):
     """GNSS velocity: the receiver's position was rejected at the same time, and reflections upset both."""
     DUPLICATE = 11
     """Arrival order: the sensor's measurement of this time is there already."""
+    MODES_AGREE = 12
+    """Pose fix with two modes: the directions in which they differ dropped, the rest applied."""
+    MULTI_MODAL = 13
+    """Pose fix with two modes that agree in no observed direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +82,8 @@ class Decisions:
     (Sensor, Reason); row (M,) index into the log's record (-1: none); innovation, innovation_sigma (M, 3), NaN where
     unused: GNSS in ENU; pose fix along and left of the estimated heading m, yaw rad (partly accepted: the kept
     directions, in sigmas of the gate); wheel forward, non-holonomic lateral and vertical m/s; nis, threshold (M,),
-    dof (M,) int8; moved_m, moved_yaw (M,): how far the update moved position (m) and yaw (rad).
+    dof (M,) int8; moved_m, moved_yaw (M,): how far the update moved position (m) and yaw (rad); weight (M,): by what a
+    robust kernel multiplied the measurement's information, 1 without one, 0 if rejected.
     """
 
     t_ns: NDArray[np.int64]
@@ -93,6 +98,7 @@ class Decisions:
     dof: NDArray[np.int8]
     moved_m: Floats
     moved_yaw: Floats
+    weight: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

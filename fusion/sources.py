@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion.config import FusionConfig
 from fusion.events import Measurements
+from fusion.modes import spread_of
 from fusion.result import Reason, Sensor
 from fusion.state import Floats
 from sensors.errors import EgolocError
@@ -56,7 +57,7 @@ _SENSORS = (
     *(Sensor.GNSS_POSITION,) * 2,
     *(Sensor.GNSS_VELOCITY,) * 2,
     *(Sensor.GNSS_YAW,) * 2,
-    *(Sensor.POSE_FIX,) * 4,
+    *(Sensor.POSE_FIX,) * 5,
     *(Sensor.WHEEL,) * 2,
 )
 """Whose each column of Measurements is."""
@@ -177,8 +178,8 @@ def _velocity(velocity: GnssVelocity, vehicle: Vehicle, config: FusionConfig, fi
 
 
 def _poses(fixes: PoseFix, frame: MapFrame, config: FusionConfig, first_row: int) -> Sources:
-    llh, yaw, tilt, cov = pose_columns(fixes, frame, config)
-    columns = {"pose_llh": llh, "pose_yaw": yaw, "pose_tilt": tilt, "pose_cov": cov}
+    llh, yaw, tilt, cov, spread = pose_columns(fixes, frame, config)
+    columns = {"pose_llh": llh, "pose_yaw": yaw, "pose_tilt": tilt, "pose_cov": cov, "pose_spread": spread}
     return _of(Sensor.POSE_FIX, fixes, 0.0, columns, _switch(config.pose.use, len(fixes)), first_row)
 
 
@@ -195,6 +196,7 @@ _NOTHING = Sources(
         pose_yaw=_NONE,
         pose_tilt=_NONE.reshape(0, 2),
         pose_cov=_NONE.reshape(0, 3, 3),
+        pose_spread=_NONE.reshape(0, 3),
         wheel=_NONE,
         wheel_var=_NONE,
     ),
@@ -208,15 +210,26 @@ _NOTHING = Sources(
 
 
 def _floor(cov: Floats, variances: Floats) -> Floats:
-    """Raise diagonals to at least these variances; raising a diagonal keeps a matrix positive definite."""
+    """Raise every direction of the plane, and the third axis, to at least these variances (3,), the first two equal.
+
+    A diagonal alone does not show the plane's smallest variance: a street that runs north-east hides it. What is added
+    is positive semidefinite, and keeps a matrix positive definite.
+    """
     raised = cov.copy()
-    i = np.arange(3)
-    raised[:, i, i] = np.maximum(raised[:, i, i], variances)
+    half = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1])
+    smallest = half - np.hypot(0.5 * (cov[:, 0, 0] - cov[:, 1, 1]), cov[:, 0, 1])
+    missing = np.where(smallest < variances[0], variances[0] - smallest, 0.0)
+    raised[:, 0, 0] += missing
+    raised[:, 1, 1] += missing
+    raised[:, 2, 2] = np.maximum(raised[:, 2, 2], variances[2])
     return raised
 
 
-def pose_columns(fixes: PoseFix, frame: MapFrame, config: FusionConfig) -> tuple[Floats, Floats, Floats, Floats]:
-    """Pose fixes in geodetic terms: llh on the map's ground (N, 3), yaw from east (N,), tilt (N, 2), cov ENU (N, 3, 3).
+def pose_columns(
+    fixes: PoseFix, frame: MapFrame, config: FusionConfig
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Pose fixes in geodetic terms: llh on the map's ground (N, 3), yaw from east (N,), tilt (N, 2), cov ENU (N, 3, 3)
+    with the spread (N, 3) of two modes in it.
 
     The map is linearized at each fix: (x, y) = scale R_map_enu[:2] (offset ENU). tilt is what a metre of height moves
     the point horizontally in ENU (zero in UTM; in one ENU plane the verticals differ with distance).
@@ -240,5 +253,9 @@ def pose_columns(fixes: PoseFix, frame: MapFrame, config: FusionConfig) -> tuple
     transform[:, :2, :2] = to_enu
     transform[:, 2, 2] = 1.0
     floors = np.array([model.sigma_floor_m, model.sigma_floor_m, np.radians(model.sigma_floor_yaw_deg)]) ** 2
-    cov = _floor(transform @ (fixes.cov * model.inflation) @ transform.transpose(0, 2, 1), floors)
-    return llh, np.arctan2(north, east), tilt, cov
+    quantization = np.diag([model.step_m, model.step_m, np.radians(model.step_deg)]) ** 2 / 12.0
+    stated = (fixes.cov + quantization) * model.inflation
+    cov = _floor(transform @ stated @ transform.transpose(0, 2, 1), floors)
+    spread = np.einsum("nij,nj->ni", transform, spread_of(fixes)) if model.modes else np.zeros((n, 3))
+    cov += spread[:, :, None] * spread[:, None, :]
+    return llh, np.arctan2(north, east), tilt, cov, spread

@@ -62,7 +62,7 @@ ACC_SIZE = 15
 G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8)
 
 # entries of Core.doubt_clock
-D_COUNT, D_TIME, D_AGREED, D_BELIEVED, D_SINCE = range(5)
+D_COUNT, D_TIME, D_AGREED, D_BELIEVED, D_SINCE, D_STREAK, D_LAST, D_TRACKING, D_HELD = range(9)
 
 # entries of Core.clock
 C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)
@@ -80,7 +80,8 @@ class Core(NamedTuple):
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
     aged (3,): seconds since the lasting error of GNSS was moved on, metres since that of pose fixes was, and the
     horizontal variance that the last GNSS position stated.
-    doubt (2, 8), doubt_clock (2, 5) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
+    doubt (2, 13), doubt_clock (2, 9) int64: the last rejected GNSS position and pose fix (``fusion.recovery``,
+    ``fusion.streak``); fresh (5,): the pose fix that is being judged: innovation east, north m and its R's ee, en, nn.
     phi (9, 16), M (9, n), Mt (16, 16), H, W (3, n), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (n,): scratch.
     rate (3,): the body rate before the last sample, as events at its time saw it, rad/s.
@@ -100,6 +101,7 @@ class Core(NamedTuple):
     aged: Floats
     doubt: Floats
     doubt_clock: Nanoseconds
+    fresh: Floats
     phi: Floats
     M: Floats
     Mt: Floats
@@ -132,8 +134,9 @@ def new_core(size: int = ERROR_SIZE) -> Core:
         ring_t=np.zeros(RING_SIZE, np.int64),
         quietest=np.full(2, np.inf),
         aged=np.zeros(3),
-        doubt=np.zeros((2, 8)),
-        doubt_clock=np.zeros((2, 5), np.int64),
+        doubt=np.zeros((2, 13)),
+        doubt_clock=np.zeros((2, 9), np.int64),
+        fresh=np.zeros(5),
         phi=np.zeros((9, ROW)),
         M=np.zeros((9, size)),
         Mt=np.zeros((ERROR_SIZE, ROW)),

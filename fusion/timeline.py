@@ -3,13 +3,14 @@
 Ordering lives here, outside the core: measurements are laid out by the time at which they were true.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from fusion.config import FusionConfig, check
+from fusion.config import KERNELS, FusionConfig, check
 from fusion.covariance import Noise
 from fusion.events import MOTION, OUTPUT, Events, Parameters
 from fusion.layout import layout_of
@@ -43,10 +44,8 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
     """The configuration in SI units."""
     gates, motion, pose = config.gates, config.motion, config.pose
     check(config)
-    if gates.use:
-        first, second, third = (_chi_square(gates.probability, dof) for dof in (1, 2, 3))
-    else:
-        first = second = third = np.inf
+    never = (math.inf, math.inf, math.inf)
+    inflation = math.sqrt(pose.inflation)
     layout = layout_of(vehicle, config)
     noise = noise_of(vehicle.imu, config.imu.noise_scale, motion.wheel_scale_walk if motion.wheel else 0.0)
     noise = noise._replace(
@@ -64,16 +63,21 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         bridge_ns=round(config.imu.max_bridge_s * 1e9),
         coast_accel=config.imu.coast_accel,
         coast_rate=float(np.radians(config.imu.coast_rate_deg)),
-        gate=(first, second, third),
+        gate=_thresholds(gates.probability) if gates.use else never,
         outvoted=gates.outvoted,
+        streak=gates.streak,
+        reentry=_thresholds(min(gates.reentry, gates.probability)) if gates.use else never,
+        robust=KERNELS.index(gates.robust),
+        robust_sigmas=gates.robust_sigmas,
         gnss_arm=_vector(vehicle.gnss_lever_arm),
         pose_arm=_vector(vehicle.pose_lever_arm),
         axle=_vector(vehicle.rear_axle),
         pose_limits=(
-            pose.max_sigma_longitudinal_m,
-            pose.max_sigma_lateral_m,
-            float(np.radians(pose.max_sigma_yaw_deg)),
+            inflation * pose.max_sigma_longitudinal_m,
+            inflation * pose.max_sigma_lateral_m,
+            float(np.radians(inflation * pose.max_sigma_yaw_deg)),
         ),
+        pose_partial=pose.partial,
         zero_velocity=motion.zero_velocity and vehicle.land_vehicle,
         non_holonomic=motion.non_holonomic and vehicle.land_vehicle,
         wheel_slip=motion.wheel_slip,
@@ -89,6 +93,11 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         zero_velocity_var=motion.zero_velocity_sigma**2,
         zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2) + noise.gyro_psd * motion.rate_hz,
     )
+
+
+def _thresholds(probability: float) -> tuple[float, float, float]:
+    """For 1, 2 and 3 degrees of freedom."""
+    return _chi_square(probability, 1), _chi_square(probability, 2), _chi_square(probability, 3)
 
 
 def _chi_square(probability: float, dof: int) -> float:

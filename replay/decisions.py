@@ -18,7 +18,7 @@ Rows = NDArray[np.int64]
 Columns = dict[str, NDArray[Any]]
 Point = tuple[float, float, float]
 
-APPLIED = (Reason.ACCEPTED, Reason.PARTLY_ACCEPTED, Reason.USED_FOR_ALIGNMENT)
+APPLIED = (Reason.ACCEPTED, Reason.PARTLY_ACCEPTED, Reason.MODES_AGREE, Reason.USED_FOR_ALIGNMENT)
 FIXES = (Sensor.GNSS_POSITION, Sensor.POSE_FIX)
 """Measurements of a point in the map."""
 _IS_APPLIED = np.isin(np.arange(len(Reason)), APPLIED)
@@ -56,7 +56,7 @@ def decision_columns(
 def no_rows() -> Columns:
     """The columns of decisions.parquet, without a row."""
     t_ns, codes, one, three = np.empty(0, np.int64), np.empty(0, np.int8), np.empty(0), np.empty((0, 3))
-    none = Decisions(t_ns, t_ns, codes, t_ns, codes, three, three, one, one, codes, one, one)
+    none = Decisions(t_ns, t_ns, codes, t_ns, codes, three, three, one, one, codes, one, one, one)
     return decision_columns(none, t_ns, {})
 
 
@@ -65,7 +65,7 @@ def _tests_of(decisions: Decisions) -> Columns:
     columns: Columns = {}
     for name in ("innovation", "innovation_sigma"):
         columns |= {f"{name}_{i}": column.astype(np.float32) for i, column in enumerate(getattr(decisions, name).T)}
-    for name in ("nis", "threshold", "moved_m", "moved_yaw"):
+    for name in ("nis", "threshold", "moved_m", "moved_yaw", "weight"):
         columns[name] = getattr(decisions, name).astype(np.float32)
     return columns | {"dof": decisions.dof.astype(np.int8)}
 

@@ -35,7 +35,7 @@ class Inventory:
         self._tags = {"scene": _TagTimes(), "mode": _TagTimes()}
         self._contents = Contents()
         self._imu: ImuWatch | None = None
-        self._headings = 0
+        self._headings = self._two_modes = 0
         self._first = Log()
         self._left_out: list[LeftOut] = []
 
@@ -51,6 +51,8 @@ class Inventory:
             self._imu.add(piece.imu)
         if piece.gnss is not None:
             self._status += np.bincount(piece.gnss.status, minlength=len(GnssStatus))
+        if piece.pose_fixes is not None:
+            self._two_modes += int((piece.pose_fixes.weights[:, 1] > 0.0).sum())
         if piece.reference is not None:
             self._headings += _headings(piece.reference)
         self._tags["scene"].add(piece.scene)
@@ -79,6 +81,7 @@ class Inventory:
             "duration_s": 0.0 if first is None or last is None else (last - first) / NS_PER_S,
             "sensors": {sensor: timing(steps, regular=sensor not in self._tags) for sensor, steps in present.items()},
             "gnss_status": {s.name.lower(): int(n) for s, n in zip(GnssStatus, self._status, strict=True) if n},
+            "two_modes": self._two_modes,
             **{f"{kind}_s": {} if last is None else times.until(last) for kind, times in self._tags.items()},
             "vehicle": msgspec.to_builtins(self._first.vehicle),
             "map_frame": msgspec.to_builtins(self._first.map_frame),
@@ -221,6 +224,8 @@ def print_inventory(found: Mapping[str, Any]) -> None:
     console.print(_sensor_table(found["sensors"]), "")
     if found["gnss_status"]:
         console.print("GNSS: " + ", ".join(f"{n} {status}" for status, n in found["gnss_status"].items()))
+    if found["two_modes"]:
+        console.print(f"Pose fixes: {found['two_modes']} tell two modes of their posterior")
     for kind, label in (("scene_s", "Scene"), ("mode_s", "Drive mode")):
         if found[kind]:
             console.print(f"{label}: {_tag_text(found[kind])}")

@@ -105,6 +105,14 @@ def positive_definite(cov: Floats) -> NDArray[np.bool_]:
     return result
 
 
+def sound_modes(modes: Floats, weights: Floats) -> NDArray[np.bool_]:
+    """Which of (N, 2, 3) modes with weights (N, 2) a PoseFix can hold: (N,) bool."""
+    known = np.isfinite(modes).all(axis=2) | (weights == 0.0)
+    first, second = weights.T
+    result: NDArray[np.bool_] = known.all(axis=1) & (first >= second) & (second >= 0.0) & (first + second <= 1.0 + 1e-9)
+    return result
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Imu(_Columns):
     """Inertial samples in body axes.
@@ -161,16 +169,35 @@ class GnssVelocity(_Columns):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFix(_Columns):
-    """EgoVM's measurements. pose: (N, 3) map x m, map y m, yaw rad; cov: (N, 3, 3) in (m, m, rad), map axes."""
+    """EgoVM's measurements. pose: (N, 3) map x m, map y m, yaw rad; cov: (N, 3, 3) in (m, m, rad), map axes.
+
+    cov is that of the finest level of the histogram; along directions in which a coarser level was flat it has that
+    level's as well (``sensors.histogram.stated_covariance``), for there the finest one saw only a corner of the whole.
+    modes: (N, 2, 3) the two strongest modes of the posterior, the stronger first, as pose; weights: (N, 2) its mass in
+    each. A mode that there is not, or that nobody looked for, has weight 0 and is NaN.
+    """
 
     pose: Floats
     cov: Floats
+    modes: Floats = None  # type: ignore[assignment]
+    weights: Floats = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         self._set_time()
         self._set("pose", (3,))
         self._set("cov", (3, 3))
         _check_covariance("PoseFix.cov", self.cov)
+        given: Floats | None = self.weights
+        if given is None:
+            object.__setattr__(self, "weights", np.zeros((len(self), 2)))
+        self._set("modes", (2, 3), missing=True)
+        self._set("weights", (2,))
+        if self.weights.any() and (bad := ~sound_modes(self.modes, self.weights)).any():
+            row = int(np.argmax(bad))
+            raise EgolocError(
+                "PoseFix.weights: expected falling masses of at most 1 together, and a mode for each above 0, "
+                f"row {row} has {self.weights[row].tolist()} for modes {self.modes[row].tolist()}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

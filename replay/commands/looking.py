@@ -49,12 +49,13 @@ class View:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure speed side by side with other libraries, in one run on one core."""
+    """Measure speed side by side with other libraries, in one run on one core; or how well gates do."""
 
-    name: tyro.conf.Positional[Literal["filter", "live", "replay", "mcap"]]
-    """filter: IMU steps/s; live: time of a push; replay: an hour of log to metrics.json; mcap: IMU messages/s read."""
+    name: tyro.conf.Positional[Literal["filter", "live", "replay", "mcap", "gates"]]
+    """filter: IMU steps/s; live: time of a push; replay: an hour of log to metrics.json; mcap: messages/s; gates: naive
+    gates beside ours."""
     repeats: int = 5
-    """Timed calls of each row, after one that warms up; the median counts."""
+    """Timed calls of each row, after one that warms up; the median counts. Of gates: drives of each scene."""
     hours: tuple[float, ...] = (1.0,)
     """Lengths of the log, h (replay: figures of each and how the time grows; live: the first)."""
     json: bool = False
@@ -65,14 +66,15 @@ class Bench:
         from replay.bench.measure import one_core
 
         options = {"hours": self.hours} if self.name in ("replay", "live") else {}
+        bench = import_module(f"replay.bench.{self.name}")
         with stage(f"benchmark {self.name}"), one_core():
-            result = import_module(f"replay.bench.{self.name}").run(repeats=self.repeats, **options)
+            result = bench.run(repeats=self.repeats, **options)
         if self.json:
             print_json(result)
             return
         from replay.table import bench_table, output_console
 
-        output_console().print(bench_table(result))
+        output_console().print(bench.table(result) if self.name == "gates" else bench_table(result))
 
 
 def check_no_campaign(folder: Path) -> None:

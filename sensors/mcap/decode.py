@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sensors.mcap.columns import Topic
 from sensors.mcap.decoded import Decoded, build
+from sensors.mcap.modes import PoseModes
 from sensors.mcap.tags import decode_tags
 from sensors.records import (
     GnssFix,
@@ -24,6 +25,7 @@ from sensors.records import (
     Trajectory,
     WheelSpeed,
     positive_definite,
+    sound_modes,
 )
 from sensors.rotation import wrap, yaw_from_q
 
@@ -163,6 +165,19 @@ def decode_pose_fixes(topic: Topic) -> Decoded:
     return build(PoseFix, topic, {"pose": pose, "cov": cov}, valid)
 
 
+def decode_pose_modes(topic: Topic) -> Decoded:
+    """egoloc_msgs/PoseModes."""
+    modes, weights = topic.column("modes").reshape(-1, 2, 3), topic.column("weights")
+    given = weights[:, :, None] != 0.0
+    used = np.where(given, modes, np.nan)
+    valid = {
+        **_sane("modes", np.where(given, modes[:, :, :2], 0.0).reshape(-1, 4), MAX_COORDINATE, "m"),
+        "weights are no falling masses of modes": sound_modes(used, weights),
+    }
+    used[:, :, 2] = wrap(used[:, :, 2])
+    return build(PoseModes, topic, {"modes": used, "weights": weights}, valid)
+
+
 def decode_wheel(topic: Topic) -> Decoded:
     """TwistWithCovarianceStamped in body axes: linear.x and its variance."""
     speed, variance = topic.column("speed"), topic.column("variance")
@@ -197,6 +212,7 @@ DECODERS: Mapping[str, Callable[[Topic], Decoded | None]] = {
     "gnss": decode_gnss,
     "gnss_velocity": decode_gnss_velocity,
     "pose_fixes": decode_pose_fixes,
+    "pose_modes": decode_pose_modes,
     "wheel": decode_wheel,
     "reference": decode_reference,
     "scene": decode_tags,

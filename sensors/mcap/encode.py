@@ -19,7 +19,7 @@ from sensors.mcap import cdr
 from sensors.mcap.decode import SIGMA_95
 from sensors.mcap.schemas import schema_text
 from sensors.mcap.tags import problem
-from sensors.mcap.topics import GPS_FIX, IMU, ODOMETRY, POSE, STRING, TWIST
+from sensors.mcap.topics import GPS_FIX, IMU, ODOMETRY, POSE, POSE_MODES, STRING, TWIST
 from sensors.records import GnssFix, GnssStatus, GnssVelocity, Imu, Log, PoseFix, Tags, Trajectory, WheelSpeed
 
 Floats = NDArray[np.float64]
@@ -40,7 +40,17 @@ _SOURCE_GPS = 1
 _SOURCE_POINTS = 2
 
 
-TOPICS = ("/imu", "/gnss/fix", "/gnss/velocity", "/egovm/pose", "/wheel/speed", "/reference", "/scene", "/drive_mode")
+TOPICS = (
+    "/imu",
+    "/gnss/fix",
+    "/gnss/velocity",
+    "/egovm/pose",
+    "/wheel/speed",
+    "/reference",
+    "/scene",
+    "/drive_mode",
+    "/egovm/modes",
+)
 """What we write, in the order of the channels."""
 
 
@@ -95,6 +105,8 @@ def messages_of(log: Log) -> list[Messages]:
         made.append(_gnss_velocity(log.gnss_velocity))
     if log.pose_fixes:
         made.append(_pose_fixes(log.pose_fixes))
+        if (known := log.pose_fixes.weights.any(axis=1)).any():
+            made.append(_pose_modes(log.pose_fixes[known]))
     if log.wheel:
         made.append(_wheel(log.wheel))
     if log.reference:
@@ -180,6 +192,14 @@ def _pose_fixes(fixes: PoseFix) -> Messages:
         **_diagonal("pose.covariance", (2, 3, 4), UNMEASURED),
     }
     return _messages("/egovm/pose", POSE, "map", fixes.t_ns, fixes.arrival_ns, fields)
+
+
+def _pose_modes(fixes: PoseFix) -> Messages:
+    fields: Fields = {
+        **{f"modes[{3 * k + i}]": fixes.modes[:, k, i] for k in range(2) for i in range(3)},
+        **{f"weights[{k}]": fixes.weights[:, k] for k in range(2)},
+    }
+    return _messages("/egovm/modes", POSE_MODES, "map", fixes.t_ns, fixes.arrival_ns, fields)
 
 
 def _wheel(wheel: WheelSpeed) -> Messages:

@@ -20,9 +20,10 @@ from sensors.mcap.assembly import METADATA, Facts, News, damage, read_facts, unu
 from sensors.mcap.columns import Topic
 from sensors.mcap.feeds import Feed, Judged, settle
 from sensors.mcap.gather import Gatherer
+from sensors.mcap.modes import join_modes
 from sensors.mcap.pace import HOLD_NS, Pace
 from sensors.mcap.sections import open_container
-from sensors.mcap.topics import Roles, assign, check_choice, conflict, wanted_by
+from sensors.mcap.topics import PARTS, Roles, assign, check_choice, conflict, wanted_by
 from sensors.pieces import PIECE_S, SENSORS
 from sensors.records import LeftOut, Log
 
@@ -33,6 +34,8 @@ SLACK_NS = HOLD_NS // 10
 MAX_ROWS = 1 << 19
 """Rows of one topic (in a window of PIECE_S or less) after which windows are looked at, whatever the log times say."""
 
+_FED = (*SENSORS, *PARTS)
+"""Sensors that have topics."""
 NOTHING_DUE = int(np.iinfo(np.int64).min)
 """Before every stamp."""
 
@@ -140,13 +143,13 @@ class LogReader:
             if topic is not None and topic is not feed.topic and feed.carry.last_ns is not None:
                 self.roles.sensors[sensor] = feed.topic
                 self.roles.ignored[topic.name] = f"{sensor} came from {feed.topic.name} before its first message"
-        for sensor in SENSORS:
+        for sensor in _FED:
             topic = self.roles.sensors.get(sensor)
             if topic is None:
                 self._feeds.pop(sensor, None)
             elif sensor not in self._feeds or self._feeds[sensor].topic is not topic:
                 self._feeds[sensor] = Feed(sensor, topic)
-        self._feeds = {sensor: self._feeds[sensor] for sensor in SENSORS if sensor in self._feeds}
+        self._feeds = {sensor: self._feeds[sensor] for sensor in _FED if sensor in self._feeds}
 
     def _judge(self, read_up_to: int | None) -> list[Judged]:
         """All rows of all sensors."""
@@ -193,6 +196,9 @@ class LogReader:
                 if end_ns is not None:
                     one.feed.passed_on(t_ns, columns["arrival_ns"])
                 self.rows[one.feed.sensor] += len(t_ns)
+        if "pose_modes" in self._feeds:
+            for rows in windows.values():
+                self._left_out += join_modes(rows, self._feeds["pose_modes"].topic.name)
         return windows
 
     def _settle(self, judged: Sequence[Judged], end_ns: int | None) -> None:

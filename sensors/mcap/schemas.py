@@ -1,6 +1,8 @@
 """The ROS 2 message definitions that our logs carry (ros2msg text with dependencies), so that other tools open them.
 
-Sources: common_interfaces (Humble) and gps_msgs (swri-robotics/gps_umd), without comments.
+Sources: common_interfaces (Humble) and gps_msgs (swri-robotics/gps_umd), without comments. PoseModes is our own:
+the two strongest modes of the posterior behind the pose fix of the same stamp, x m, y m and yaw rad of the stronger,
+then of the other (NaN: none), and the posterior's mass in each. The fix itself is a message that every tool reads.
 """
 
 _DEFINITIONS = {
@@ -27,6 +29,7 @@ geometry_msgs/Vector3 angular_velocity
 float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
 float64[9] linear_acceleration_covariance""",
+    "egoloc_msgs/PoseModes": "std_msgs/Header header\nfloat64[6] modes\nfloat64[2] weights",
     "gps_msgs/GPSStatus": """std_msgs/Header header
 uint16 satellites_used
 int32[] satellite_used_prn

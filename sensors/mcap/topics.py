@@ -17,6 +17,10 @@ ODOMETRY = "nav_msgs/Odometry"
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 TWIST = "geometry_msgs/TwistWithCovarianceStamped"
 STRING = "std_msgs/String"
+POSE_MODES = "egoloc_msgs/PoseModes"
+
+PARTS = ("pose_modes",)
+"""What completes the rows of another sensor with the same stamps, on a topic of its own (``sensors.mcap.modes``)."""
 
 MAP_FRAMES = frozenset({"map", "world"})
 """frame_id of poses in map coordinates."""
@@ -37,6 +41,7 @@ _FEEDS = {
     POSE: ("pose_fixes", "reference"),
     TWIST: ("gnss_velocity", "wheel"),
     STRING: ("scene", "mode"),
+    POSE_MODES: PARTS,
 }
 """Schema -> sensors that it can feed."""
 _ON_REQUEST = {(ODOMETRY, "pose_fixes"), (POSE, "reference")}
@@ -66,6 +71,7 @@ _POSE = {"p": _xyz("pose.pose.position"), "q": _xyz("pose.pose.orientation", "xy
 _FULL_POSE = _POSE | {"cov": _elements("pose.covariance", (0, 1, 5, 6, 7, 11, 30, 31, 35))}
 _REFERENCE = _POSE | {"variance": _elements("pose.covariance", (0, 7, 14, 35))}
 _LINEAR = _xyz("twist.twist.linear")
+_MODES = {"modes": _elements("modes", range(6)), "weights": _elements("weights", range(2))}
 _COLUMNS: dict[tuple[str, str], Mapping[str, Sequence[str]]] = {
     (IMU, "imu"): {
         "gyro": _xyz("angular_velocity"),
@@ -82,6 +88,7 @@ _COLUMNS: dict[tuple[str, str], Mapping[str, Sequence[str]]] = {
     (ODOMETRY, "pose_fixes"): _FULL_POSE,
     (POSE, "reference"): _REFERENCE,
     (POSE, "pose_fixes"): _FULL_POSE,
+    (POSE_MODES, "pose_modes"): _MODES,
     (TWIST, "gnss_velocity"): {
         "vel": _LINEAR,
         "cov": _elements("twist.covariance", (0, 1, 2, 6, 7, 8, 12, 13, 14)),
@@ -97,8 +104,9 @@ def feeds(schema: str) -> tuple[str, ...]:
 
 def check_choice(chosen: Mapping[str, str]) -> None:
     """Raise unless every key names a sensor."""
-    for sensor in set(chosen) - set(SENSORS):
-        raise EgolocError(f"topics.{sensor}: no such sensor, expected one of {', '.join(SENSORS)}")
+    known = (*SENSORS, *PARTS)
+    for sensor in set(chosen) - set(known):
+        raise EgolocError(f"topics.{sensor}: no such sensor, expected one of {', '.join(known)}")
 
 
 def wanted_by(chosen: Mapping[str, str]) -> Callable[[str, str], Wanted | None]:

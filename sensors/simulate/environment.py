@@ -40,6 +40,10 @@ class Landmarks(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Places where the matcher locks onto the next lane dash, 1/km."""
     lane_alias_per_km: NonNegative = 0.0
     """Places where it locks onto the next lane, 1/km."""
+    dash_twin_per_km: NonNegative = 0.0
+    """Places where the next lane dash is the weaker of two modes: the fix is right, and tells both, 1/km."""
+    lane_twin_per_km: NonNegative = 0.0
+    """The same with the next lane, 1/km."""
 
 
 class Road(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

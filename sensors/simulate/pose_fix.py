@@ -1,5 +1,7 @@
 """Simulated EgoVM pose fixes: map x, y, yaw with the covariance that a network would state."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
@@ -43,8 +45,8 @@ class PoseFixSensor:
         """rng: its numbers go to what happens on the course, then to noise frame by frame."""
         self._course, self._frame, self._vehicle, self._config = course, frame, vehicle, config
         self._night = config.night_factor if night else 1.0
-        happening, slow, self._white, late, self._frames = rng.spawn(5)
-        self._history = MatchingHistory(course, config, happening)
+        happening, slow, self._white, late, self._frames, modes = rng.spawn(6)
+        self._history = MatchingHistory(course, config, happening, modes)
         nodes = int((course.s[-1] - course.s[0]) / GRID_M) + 2
         self._nodes = course.s[0] + GRID_M * np.arange(nodes)
         self._log_sigma = _log_sigmas(nodes, config, happening)
@@ -67,6 +69,7 @@ class PoseFixSensor:
         place = map_from_llh(self._frame, motion.place_of(self._vehicle.pose_lever_arm))
         yaw = yaw_in_map(motion, self._frame)
         fixes = _fixes(t_ns, self._delay.arrivals(t_ns), place, yaw, sigma, error)
+        fixes = _with_modes(fixes, yaw, self._history.second_mode(s))
         return fixes[~dropped] if dropped.any() else fixes
 
     def _sigmas(self, t: Floats, s: Floats) -> Floats:
@@ -117,3 +120,18 @@ def _fixes(
     cov[:, 0, 1] = cov[:, 1, 0] = cosine * sine * (variance[:, 0] - variance[:, 1])
     cov[:, 2, 2] = variance[:, 2]
     return PoseFix(t_ns, arrival_ns, np.stack((x, y, wrap(yaw + turn)), axis=-1), cov)
+
+
+def _with_modes(fixes: PoseFix, yaw: Floats, second: Floats) -> PoseFix:
+    """The fixes with second modes: second (N, 3) m along and left of the true yaw (N,), and their mass, 0: none."""
+    along, left, mass = second.T
+    if not mass.any():
+        return fixes
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    modes = np.stack((fixes.pose, fixes.pose), axis=1)
+    modes[:, 1, 0] += cosine * along - sine * left
+    modes[:, 1, 1] += sine * along + cosine * left
+    modes[mass == 0.0] = np.nan
+    return replace(
+        fixes, modes=modes, weights=np.where(mass[:, None] > 0.0, np.stack((1.0 - mass, mass), axis=-1), 0.0)
+    )

@@ -1,6 +1,6 @@
 """Every number of the simulated map matching."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -71,6 +71,11 @@ class PoseFixSimulation(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """From a lane to the next, m."""
     alias_m: Positive = 15.0
     """Mean length of a stretch matched one dash or one lane off, m."""
+
+    alias_modes_fraction: Fraction = 0.5
+    """Share of these stretches whose fixes tell both modes, the wrong one as the stronger, -."""
+    alias_covariance: Literal["both", "one"] = "both"
+    """The stated covariance there: that of both modes, or of the stronger alone (a finest level sees no other)."""
 
     gross_per_hour: NonNegative = 0.0
     """How often a frame locks onto something else altogether, with the usual covariance, 1/h."""

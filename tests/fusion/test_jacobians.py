@@ -152,7 +152,7 @@ def fix_in(frame: MapFrame) -> Residual:
         yaw_map = yaw_from_q(attitude_in_map(motion, frame))[0]
         now = np.zeros(1, np.int64)
         fix = PoseFix(now, now, np.array([[p_map[0], p_map[1], yaw_map]]), np.eye(3)[None])
-        llh, east_yaw, tilt, _ = pose_columns(fix, frame, HONEST)
+        llh, east_yaw, tilt, *_ = pose_columns(fix, frame, HONEST)
         r = attitude(NAV)
         length = float(np.hypot(r[0], r[3]))
         heading = (r[0] / length, r[3] / length)

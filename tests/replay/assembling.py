@@ -70,7 +70,7 @@ def nothing(aligned_ns: int | None) -> FusionResult:
     none, three, six = np.empty(0), np.empty((0, 3)), np.empty((0, 6, 6))
     t_ns, codes = np.empty(0, np.int64), np.empty(0, np.int8)
     states = States(t_ns, three, three, np.empty((0, 4)), three, three, six, np.empty((0, 15)))
-    decided = Decisions(t_ns, t_ns, codes, t_ns, codes, three, three, none, none, codes, none, none)
+    decided = Decisions(t_ns, t_ns, codes, t_ns, codes, three, three, none, none, codes, none, none, none)
     return FusionResult(states, decided, aligned_ns)
 
 

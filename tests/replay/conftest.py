@@ -116,6 +116,7 @@ def _decisions(rng: np.random.Generator, states: dict[str, Any], hz: float) -> d
         "dof": np.full(n, 3, np.int8),
         "moved_m": np.full(n, 0.01),
         "moved_yaw": np.full(n, 1e-4),
+        "weight": np.ones(n),
         "z": np.where(placed, 30.0, np.nan),
         "yaw": np.where(sensor == 1, states["yaw"][index], np.nan),
     }

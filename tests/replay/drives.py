@@ -119,6 +119,7 @@ def decisions(log: Log) -> Decisions:
         np.full(n, 3, np.int8),
         np.zeros(n),
         np.zeros(n),
+        np.ones(n),
     )
 
 

@@ -33,8 +33,8 @@ STATES = (
 )
 DECISIONS = (
     "t_ns arrival_ns sensor row reason accepted innovation_0 innovation_1 innovation_2 innovation_sigma_0 "
-    "innovation_sigma_1 innovation_sigma_2 nis threshold moved_m moved_yaw dof x y z yaw err_lon err_lat err_yaw "
-    "status scene mode log"
+    "innovation_sigma_1 innovation_sigma_2 nis threshold moved_m moved_yaw weight dof x y z yaw err_lon err_lat "
+    "err_yaw status scene mode log"
 )
 RUN_FILES = [
     *("config.toml", "decisions.parquet", "manifest.json", "metrics.json"),

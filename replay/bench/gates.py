@@ -1,0 +1,85 @@
+"""`egoloc bench gates`: naive ways of gating beside ours, on drives in which each of them fails.
+
+Every way is a config of the same filter. AR and the largest error are those of a replay's metrics.json, over drives of
+seeds that nothing was tuned on.
+"""
+
+from typing import Any
+
+import msgspec
+from rich.table import Table
+
+from fusion.config import FusionConfig, Gates, PoseModel
+from replay.bench.gate_scenes import DURATION_S, SCENES, Method
+from replay.bench.measure import conditions, row
+from replay.config import RunConfig
+from replay.drive import Drive
+from replay.metrics import metrics_of
+from replay.scoring import Scorer
+from sensors.records import Log
+
+FIRST_SEED = 700_000
+BLINDFOLDED = PoseModel(max_sigma_longitudinal_m=1e6, max_sigma_lateral_m=1e6, max_sigma_yaw_deg=1e6, modes=False)
+"""No covariance gate."""
+ALONE = Gates(outvoted=10**9, streak=10**9)
+"""Chi-square and nothing else."""
+
+
+def _ours(**gates: Any) -> Method:
+    return Method(FusionConfig(gates=Gates(**gates)))
+
+
+METHODS = {
+    "accept everything": Method(
+        FusionConfig(pose=BLINDFOLDED, gates=msgspec.structs.replace(ALONE, use=False)), every_level=False
+    ),
+    "chi-square alone": Method(FusionConfig(pose=BLINDFOLDED, gates=ALONE), every_level=False),
+    "whole fix rejected": Method(FusionConfig(pose=PoseModel(partial=False), gates=ALONE)),
+    "ours": _ours(),
+    "ours, Huber": _ours(robust="huber"),
+    "ours, Cauchy": _ours(robust="cauchy"),
+}
+
+
+def run(repeats: int = 5) -> dict[str, Any]:
+    """Rows of AR and of the largest horizontal error along an axis, m, over `repeats` seeds of each scene."""
+    rows = []
+    seeds = range(FIRST_SEED, FIRST_SEED + repeats)
+    for scene, (_, make) in SCENES.items():
+        for name, method in METHODS.items():
+            found = [scored(make(seed, method), method.config) for seed in seeds]
+            for metric, values in zip(("ar", "peak_m"), zip(*found, strict=True), strict=True):
+                rows.append(row(f"{scene}: {name}", metric, values))
+    stories = {scene: story for scene, (story, _) in SCENES.items()}
+    facts = {"seeds": list(seeds), "duration_s": DURATION_S, "scenes": stories}
+    return {"bench": "gates", "rows": rows, "ratios": {}, "conditions": conditions(["numba", "numpy"], **facts)}
+
+
+def scored(log: Log, config: FusionConfig) -> tuple[float, float]:
+    """AR and the largest error along or across the road, m, of a replay."""
+    drive = Drive(log, RunConfig(fusion=config), "bench gates")
+    batches = [drive.push(log), drive.finish()]
+    assert drive.start_ns is not None
+    scorer = Scorer(drive.config.limits, log="bench", period_ns=drive.period_ns, start_ns=drive.start_ns)
+    for batch in batches:
+        scorer.add(batch.states, batch.decisions)
+    fusion = metrics_of(scorer.finish(drive.facts(), batches[-1].scenes, batches[-1].modes))["methods"]["fusion"]
+    return fusion["ar"], max(fusion[axis]["max"] for axis in ("lon", "lat"))
+
+
+def table(result: dict[str, Any]) -> Table:
+    """A block for each scene: median and worst AR, median and largest error."""
+    from replay.table import bare_table
+
+    shown = bare_table(2)
+    for header in ("scene", "gates"):
+        shown.add_column(header)
+    for header in ("AR %", "worst", "peak m", "worst"):
+        shown.add_column(header, justify="right")
+    rows = {(entry["name"], entry["metric"]): entry for entry in result["rows"]}
+    for scene in SCENES:
+        for number, name in enumerate(METHODS):
+            ar, peak = (rows[f"{scene}: {name}", metric] for metric in ("ar", "peak_m"))
+            figures = (100 * ar["median"], 100 * ar["min"], peak["median"], peak["max"])
+            shown.add_row(scene if number == 0 else "", name, *(f"{figure:.2f}" for figure in figures))
+    return shown
