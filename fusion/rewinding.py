@@ -48,6 +48,7 @@ _WAIT_NS = 60 * NS_PER_S
 """Without a first state, a pushed measurement waits for the IMU until it is so much older than another."""
 _NO_TIME = read_only(np.empty(0, np.int64))
 _NO_AXES = read_only(np.empty((0, 3)))
+_NO_IMU = Imu(_NO_TIME, _NO_TIME, _NO_AXES, _NO_AXES)
 
 
 class RewindingNavigator(Navigator):
@@ -110,10 +111,10 @@ class RewindingNavigator(Navigator):
 
     def advance(self, known_ns: int) -> None:
         """Go on with all that is due by known_ns: no row that is due sooner is added later."""
-        if not self._imu:
+        if not self._imu and self.core is None:
             return
-        imu: Imu = pieces.joined(self._imu)
-        imu_due, known_ns = np.concatenate(self._due), min(known_ns, FOREVER - 1)
+        imu: Imu = pieces.joined(self._imu or [_NO_IMU])
+        imu_due, known_ns = np.concatenate(self._due or [_NO_TIME]), min(known_ns, FOREVER - 1)
         last = int(np.searchsorted(imu_due, known_ns, side="right"))
         if self.core is None and not self._start(imu, imu_due, known_ns):
             if last:
