@@ -56,29 +56,12 @@ def process(
     Events lie at or after the state's time. Between two samples the signals are curves, so an event is met at its own
     time, not at a sample's.
     """
-    reached: int = _pass(core, imu_t, gyro, accel, ev, first_event, m, par, rec, False)
-    return reached
-
-
-@kernel()
-def process_keeping(
-    core: Core,
-    imu_t: NDArray[np.int64],
-    gyro: Floats,
-    accel: Floats,
-    ev: Events,
-    first_event: int,
-    m: Measurements,
-    par: Parameters,
-    rec: Recorder,
-) -> int:
-    """The same with snapshots, and after going back to one of them (``fusion.arrival``)."""
-    reached: int = _pass(core, imu_t, gyro, accel, ev, first_event, m, par, rec, True)
+    reached: int = sweep(core, imu_t, gyro, accel, ev, first_event, m, par, rec, False)
     return reached
 
 
 @kernel(inline="always")
-def _pass(
+def sweep(
     core: Core,
     imu_t: NDArray[np.int64],
     gyro: Floats,
@@ -90,7 +73,7 @@ def _pass(
     rec: Recorder,
     keeps: bool,
 ) -> int:
-    """The loop itself; keeps: a constant, so that nobody pays for what he does not use."""
+    """The loop itself. keeps: a constant; with snapshots (``fusion.arrival``), or none that anybody would pay for."""
     e = first_event
     events = len(ev.t)
     nav, earth, acc, span, clock = core.nav, core.earth, core.acc, core.span, core.clock

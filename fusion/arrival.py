@@ -9,7 +9,7 @@ were made when a measurement was first applied. Met again, a measurement is gate
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion._kernels import _record, process_keeping
+from fusion._kernels import _record, sweep
 from fusion.events import AGAIN, MOTION, OUTPUT, Events, Parameters, Recorder
 from fusion.history import (
     I_ARRIVAL,
@@ -132,7 +132,7 @@ def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: 
         begin = core.clock[C_COUNT] & (size - 1)
         end = min(begin + mark[M_SAMPLES] - core.clock[C_COUNT], size)
         t, gyro, accel = played.t[begin:end], played.gyro[begin:end], played.accel[begin:end]
-        met = process_keeping(core, t, gyro, accel, events, met, history.m, par, rec)
+        met = sweep(core, t, gyro, accel, events, met, history.m, par, rec, True)
     for k in range(decided, rec.filled[1]):
         e = rec.event[k]
         stamps[k, 0], stamps[k, 1], stamps[k, 2] = every.t[e], history.arrival_ns[e], history.log_row[e]
