@@ -24,6 +24,7 @@ check: .venv/installed-dev  ## what pre-commit checks
 
 bench: .venv/installed-bench  ## speed, side by side with other libraries
 	$(BIN)/egoloc bench filter $(ARGS)
+	$(BIN)/egoloc bench live $(ARGS)
 	$(BIN)/egoloc bench mcap $(ARGS)
 	$(BIN)/egoloc bench replay $(ARGS)
 

@@ -66,6 +66,24 @@ def process(
     Events lie at or after the state's time. Between two samples the signals are curves, so an event is met at its own
     time, not at a sample's.
     """
+    reached: int = sweep(core, imu_t, gyro, accel, ev, first_event, m, par, rec, False)
+    return reached
+
+
+@kernel(inline="always")
+def sweep(
+    core: Core,
+    imu_t: NDArray[np.int64],
+    gyro: Floats,
+    accel: Floats,
+    ev: Events,
+    first_event: int,
+    m: Measurements,
+    par: Parameters,
+    rec: Recorder,
+    keeps: bool,
+) -> int:
+    """The loop itself. keeps: a constant; with snapshots (``fusion.arrival``), or none that anybody would pay for."""
     e = first_event
     events = len(ev.t)
     nav, earth, acc, span, clock = core.nav, core.earth, core.acc, core.span, core.clock
@@ -77,7 +95,6 @@ def process(
         # the sample before the last one serves where the spacing is even to a quarter
         clock[C_BEND] = int(clock[C_INTERVAL] > 0 and 3 * whole <= 4 * clock[C_INTERVAL] <= 5 * whole)
         gap = whole > par.max_gap_ns
-        core.saves[S_CHANGED] |= gap
         interval = _interval(core.last, clock[C_BEND] != 0, par.increments, w, f)
         remembered = False
         while True:
@@ -97,7 +114,8 @@ def process(
                 clock[C_STATE] = stop
             if stop == t and not remembered:
                 _remember(core, t, w, f)
-                save(core, blend(interval[0], interval[1], 1.0))
+                if keeps:
+                    save(core, blend(interval[0], interval[1], 1.0), gap)
                 remembered = True
             if stop < target:
                 continue
@@ -105,14 +123,15 @@ def process(
                 break
             rate = blend(interval[0], interval[1], (stop - start) / whole) if whole > 0 else w
             guess = gap
-            if stop == start < t:  # after a rewind to the sample before
+            if keeps and stop == start < t:  # after a rewind to the sample before
                 rate, guess = (core.rate[0], core.rate[1], core.rate[2]), clock[C_INTERVAL] > par.max_gap_ns
             if not (guess and ev.kind[e] == MOTION):  # the rate in a gap is a guess
                 recorded, decided = rec.filled[0], rec.filled[1]
                 _handle(core, rec, par, m, ev, e, axpy(-1.0, (nav[10], nav[11], nav[12]), rate))
-                core.saves[S_CHANGED] = 1
-                if ev.verdict[e] == AGAIN:
-                    rec.filled[0], rec.filled[1] = recorded, decided
+                if keeps:
+                    core.saves[S_CHANGED] = 1
+                    if ev.verdict[e] == AGAIN:
+                        rec.filled[0], rec.filled[1] = recorded, decided
             e += 1
     return e
 

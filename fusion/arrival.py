@@ -1,15 +1,15 @@
 """Arrival order: IMU samples and measurements as they come, late ones at their own time by rewinding (Larsen 1998).
 
 After each arrival the state is the one that stamp order gives for all that has arrived: the newest snapshot before the
-late measurement is restored, and IMU samples and events after it are met again, in stamp order, by ``process``. What
-was recorded stays as it was: states as they were known when the IMU first reached their time, decisions as they were
-made when a measurement was first applied. Met again, a measurement is gated again, and may end otherwise.
+late measurement is restored, and IMU samples and events after it are met again, in stamp order and by the same loop.
+What was recorded stays as it was: states as they were known when the IMU first reached their time, decisions as they
+were made when a measurement was first applied. Met again, a measurement is gated again, and may end otherwise.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion._kernels import _record, process
+from fusion._kernels import _record, sweep
 from fusion.events import AGAIN, MOTION, OUTPUT, Events, Parameters, Recorder
 from fusion.history import (
     I_ARRIVAL,
@@ -132,7 +132,7 @@ def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: 
         begin = core.clock[C_COUNT] & (size - 1)
         end = min(begin + mark[M_SAMPLES] - core.clock[C_COUNT], size)
         t, gyro, accel = played.t[begin:end], played.gyro[begin:end], played.accel[begin:end]
-        met = process(core, t, gyro, accel, events, met, history.m, par, rec)
+        met = sweep(core, t, gyro, accel, events, met, history.m, par, rec, True)
     for k in range(decided, rec.filled[1]):
         e = rec.event[k]
         stamps[k, 0], stamps[k, 1], stamps[k, 2] = every.t[e], history.arrival_ns[e], history.log_row[e]

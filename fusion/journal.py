@@ -1,11 +1,16 @@
 """What the kernel records, call by call, until somebody takes it."""
 
+from dataclasses import fields
+from typing import TypeVar
+
 import numpy as np
 
 from fusion.events import Recorder, new_recorder
 from fusion.recording import decided, states
 from fusion.result import Decisions, States
 from fusion.state import Nanoseconds
+
+Columns = TypeVar("Columns", States, Decisions)
 
 _ROWS = 1024
 """States and decisions that fit into a recorder, or more."""
@@ -27,22 +32,34 @@ class Journal:
         if rec is not None and rec.filled[0] + recorded <= len(rec.t) and rec.filled[1] + made <= len(rec.event):
             return rec
         self.flush()
+        if rec is not None and self._recorder is rec and recorded <= len(rec.t) and made <= len(rec.event):
+            return rec
         self._recorder = rec = new_recorder(max(recorded, _ROWS), max(made, _ROWS))
         self.stamps = np.zeros((len(rec.event), 3), np.int64)
         return rec
 
     def flush(self) -> None:
-        """Put what the recorder holds into the lists."""
-        rec, self._recorder = self._recorder, None
+        """Put what the recorder holds into the lists. One that forgets is used again: it makes no new arrays."""
+        rec = self._recorder
         if rec is None:
             return
+        reused = self._kept is not None
         if rec.filled[0]:
-            self._states.append(states(rec))
+            known = states(rec)
+            self._states.append(_copy(known) if reused else known)
         if rec.filled[1]:
-            self._decisions.append(decided(rec, *self.stamps[: int(rec.filled[1])].T.copy()))
-        if self._kept is not None:
-            _forget(self._states, self._kept)
-            _forget(self._decisions, self._kept)
+            made = decided(rec, *self.stamps[: int(rec.filled[1])].T.copy())
+            self._decisions.append(_copy(made) if reused else made)
+        if self._kept is None:
+            self._recorder = None
+            return
+        rec.filled[:] = 0
+        _forget(self._states, self._kept)
+        _forget(self._decisions, self._kept)
+
+
+def _copy(record: Columns) -> Columns:
+    return type(record)(**{f.name: getattr(record, f.name).copy() for f in fields(record)})
 
 
 def _forget(parts: list[States] | list[Decisions], kept: int) -> None:

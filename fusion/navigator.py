@@ -3,8 +3,6 @@
 Whatever is given in one call or in many, the same operations run in the same order.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from fusion._kernels import process
@@ -67,7 +65,8 @@ class Navigator:
     def _found(self, piece: Log) -> list[Sources]:
         """The measurements of a piece, of each sensor for itself."""
         records = {name: getattr(piece, name) for name in RECORDS}
-        found = parts(replace(self._empty, **records), self._config, self._rows)
+        mine = Log(vehicle=self._empty.vehicle, map_frame=self._empty.map_frame, **records)
+        found = parts(mine, self._config, self._rows)
         for name, record in records.items():
             self._rows[name] += 0 if record is None else len(record)
         return found

@@ -36,7 +36,7 @@ from fusion.recording import unused
 from fusion.result import Decisions, Reason, States
 from fusion.snapshots import with_snapshots
 from fusion.sources import APPLY, Sources, compact
-from fusion.state import C_STATE, Floats, Nanoseconds
+from fusion.state import C_STATE, Nanoseconds
 from fusion.timeline import periods
 from sensors import pieces
 from sensors.clock import NS_PER_S
@@ -46,8 +46,11 @@ from sensors.vehicle import Vehicle
 
 _WAIT_NS = 60 * NS_PER_S
 """Without a first state, a pushed measurement waits for the IMU until it is so much older than another."""
+_NOW = np.zeros(1, np.int64)
 _NO_TIME = read_only(np.empty(0, np.int64))
 _NO_AXES = read_only(np.empty((0, 3)))
+_NO_IMU = Imu(_NO_TIME, _NO_TIME, _NO_AXES, _NO_AXES)
+_NO_SAMPLES = (_NO_TIME, _NO_AXES, _NO_AXES, _NO_TIME)
 
 
 class RewindingNavigator(Navigator):
@@ -102,18 +105,19 @@ class RewindingNavigator(Navigator):
         imu = piece.imu
         if imu is not None and len(imu):
             self._check_rising(imu)
-            self._arrive(imu.t_ns, imu.gyro, imu.accel, np.zeros(len(imu), np.int64), self._nothing, _NO_TIME)
+            now = np.zeros(len(imu), np.int64)
+            self._arrive(imu, now, self._nothing, _NO_TIME)
         for found in self._found(piece):
             for first in range(0, len(found.t_ns), NEW):
-                part = found.chosen(slice(first, first + NEW))
-                self._arrive(_NO_TIME, _NO_AXES, _NO_AXES, _NO_TIME, part, np.zeros(len(part.t_ns), np.int64))
+                part = found if len(found.t_ns) <= NEW else found.chosen(slice(first, first + NEW))
+                self._arrive(_NO_IMU, _NO_TIME, part, _NOW)
 
     def advance(self, known_ns: int) -> None:
         """Go on with all that is due by known_ns: no row that is due sooner is added later."""
-        if not self._imu:
+        if not self._imu and self.core is None:
             return
-        imu: Imu = pieces.joined(self._imu)
-        imu_due, known_ns = np.concatenate(self._due), min(known_ns, FOREVER - 1)
+        imu: Imu = pieces.joined(self._imu or [_NO_IMU])
+        imu_due, known_ns = np.concatenate(self._due or [_NO_TIME]), min(known_ns, FOREVER - 1)
         last = int(np.searchsorted(imu_due, known_ns, side="right"))
         if self.core is None and not self._start(imu, imu_due, known_ns):
             if last:
@@ -211,37 +215,29 @@ class RewindingNavigator(Navigator):
         for first in range(0, max(len(order), 1), NEW):
             rows, later = order[first : first + NEW], order[first + NEW : first + NEW + 1]
             end = int(np.searchsorted(imu_due, due[later[0]])) if len(later) else len(imu)
-            part = imu[begin:end]
-            self._arrive(part.t_ns, part.gyro, part.accel, imu_due[begin:end], waiting.chosen(rows), due[rows])
+            self._arrive(imu[begin:end], imu_due[begin:end], waiting.chosen(rows), due[rows])
             begin = max(begin, end)
         if len(order):
             rest = np.ones(len(due), np.bool_)
             rest[order] = False
             self.pending = compact(waiting.chosen(np.flatnonzero(rest)))
 
-    def _arrive(
-        self,
-        imu_t: Nanoseconds,
-        gyro: Floats,
-        accel: Floats,
-        imu_due: Nanoseconds,
-        found: Sources,
-        due: Nanoseconds,
-    ) -> None:
+    def _arrive(self, imu: Imu, imu_due: Nanoseconds, found: Sources, due: Nanoseconds) -> None:
         """Run the kernel over samples and at most NEW measurements, both sorted by when they are due."""
         core = self.core
         assert core is not None
         assert self._history is not None
-        mark = self._history.mark
+        mark, samples = self._history.mark, _NO_SAMPLES
         outputs = ticks = 0
-        if len(imu_t):
-            outputs = max(int(imu_t[-1] - mark[M_OUTPUT]) // int(mark[M_OUTPUT_PERIOD]) + 1, 0)
+        if len(imu):
+            last = int(imu.t_ns[-1])
+            outputs = max((last - int(mark[M_OUTPUT])) // int(mark[M_OUTPUT_PERIOD]) + 1, 0)
             if mark[M_TICK_PERIOD]:
-                ticks = max(int(imu_t[-1] - mark[M_TICK]) // int(mark[M_TICK_PERIOD]) + 1, 0)
-            self._history = with_room(self._history, self._most_at_once(imu_t))
+                ticks = max((last - int(mark[M_TICK])) // int(mark[M_TICK_PERIOD]) + 1, 0)
+            self._history = with_room(self._history, self._most_at_once(imu.t_ns))
+            samples = read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel), read_only(imu_due)
         count = enter(self._history, self._columns, found, due)
         rec = self._journal.room(outputs + 1, ticks + count + int(mark[M_EVENTS] - mark[M_NEXT]) + 1)
-        samples = read_only(imu_t), read_only(gyro), read_only(accel), read_only(imu_due)
         arrive(core, self._history, *samples, count, self._par, rec, self._journal.stamps)
 
     def _most_at_once(self, imu_t: Nanoseconds) -> int:

@@ -51,16 +51,15 @@ def with_snapshots(core: Core, history_s: float) -> Core:
 
 
 @kernel()
-def save(core: Core, rate: Vector) -> None:
+def save(core: Core, rate: Vector, gap: bool) -> None:
     """Take a snapshot at an IMU sample, before the events of its time, unless the last one is near.
 
-    rate: body rate that these events see, rad/s. A core without history takes none.
+    rate: body rate that these events see, rad/s; gap: the sample ends a gap, in which P has changed.
     """
-    size = len(core.saved_t)
-    if size == 0:
-        return
     saves, now = core.saves, core.clock[C_STATE]
-    if saves[S_NEWEST] >= saves[S_FIRST] and now - core.saved_t[saves[S_NEWEST] % size, 0] < SPACING_NS:
+    if gap:
+        saves[S_CHANGED] = 1
+    if saves[S_NEWEST] >= saves[S_FIRST] and now - core.saved_t[saves[S_NEWEST] % len(core.saved_t), 0] < SPACING_NS:
         return
     core.rate[0], core.rate[1], core.rate[2] = rate
     take(core)

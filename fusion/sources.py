@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion.config import FusionConfig
 from fusion.events import Measurements
+from fusion.linearized import linearize
 from fusion.modes import spread_of
 from fusion.result import Reason, Sensor
 from fusion.state import Floats
@@ -61,6 +62,9 @@ _SENSORS = (
     *(Sensor.WHEEL,) * 2,
 )
 """Whose each column of Measurements is."""
+_COLUMNS: dict[int, list[int]] = {
+    sensor: [i for i, whose in enumerate(_SENSORS) if whose == sensor] for sensor in _SENSORS
+}
 
 
 def joined(parts: Sequence[Sources]) -> Sources:
@@ -85,11 +89,15 @@ def split(found: Sources, last_ns: int) -> tuple[Sources, Sources]:
 
 def put(found: Sources, columns: Measurements, rows: Rows) -> None:
     """Write the numbers of each measurement into these rows (M,) of other columns."""
+    if len(rows) == 1:  # as in live use
+        ours, theirs = int(rows[0]), int(found.row[0])
+        for i in _COLUMNS[int(found.kind[0])]:
+            columns[i][ours] = found.measurements[i][theirs]
+        return
     for sensor in set(found.kind.tolist()):
         mine = np.flatnonzero(found.kind == sensor)
-        for column, given, whose in zip(columns, found.measurements, _SENSORS, strict=True):
-            if whose == sensor:
-                column[rows[mine]] = given[found.row[mine]]
+        for i in _COLUMNS[sensor]:
+            columns[i][rows[mine]] = found.measurements[i][found.row[mine]]
 
 
 def compact(found: Sources) -> Sources:
@@ -239,23 +247,12 @@ def pose_columns(
     p_map = np.column_stack((fixes.pose[:, :2], np.zeros(n)))
     llh = llh_from_map(frame, p_map)
     rotation, scale = rotation_map_enu(frame, llh)
-    jacobian = rotation[:, :2, :] * scale[:, None, None]
-    to_enu = np.empty((n, 2, 2))
-    determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
-    to_enu[:, 0, 0], to_enu[:, 0, 1] = jacobian[:, 1, 1], -jacobian[:, 0, 1]
-    to_enu[:, 1, 0], to_enu[:, 1, 1] = -jacobian[:, 1, 0], jacobian[:, 0, 0]
-    to_enu /= determinant[:, None, None]
-    tilt = np.einsum("nij,nj->ni", to_enu, jacobian[:, :, 2])
-    c, s = np.cos(fixes.pose[:, 2]), np.sin(fixes.pose[:, 2])
-    east = to_enu[:, 0, 0] * c + to_enu[:, 0, 1] * s
-    north = to_enu[:, 1, 0] * c + to_enu[:, 1, 1] * s
-    transform = np.zeros((n, 3, 3))
-    transform[:, :2, :2] = to_enu
-    transform[:, 2, 2] = 1.0
+    transform, tilt, yaw = np.empty((n, 3, 3)), np.empty((n, 2)), np.empty(n)
+    linearize(rotation, scale, np.ascontiguousarray(fixes.pose[:, 2]), transform, tilt, yaw)
     floors = np.array([model.sigma_floor_m, model.sigma_floor_m, np.radians(model.sigma_floor_yaw_deg)]) ** 2
     quantization = np.diag([model.step_m, model.step_m, np.radians(model.step_deg)]) ** 2 / 12.0
     stated = (fixes.cov + quantization) * model.inflation
     cov = _floor(transform @ stated @ transform.transpose(0, 2, 1), floors)
     spread = np.einsum("nij,nj->ni", transform, spread_of(fixes)) if model.modes else np.zeros((n, 3))
     cov += spread[:, :, None] * spread[:, None, :]
-    return llh, np.arctan2(north, east), tilt, cov, spread
+    return llh, yaw, tilt, cov, spread

@@ -118,17 +118,16 @@ def rotation_map_enu(frame: MapFrame, llh: ArrayLike) -> tuple[Floats, Floats]:
         to_datum = rotation_ecef_enu(np.array([_datum(frame)]))[0].T
         return to_datum @ rotation_ecef_enu(points), np.ones(len(points))
     step = 100.0 / 6_371_000.0
-    north, south = points.copy(), points.copy()
-    north[:, 0] += step
-    south[:, 0] -= step
-    meridian = (map_from_llh(frame, north) - map_from_llh(frame, south))[:, :2]
-    length = np.hypot(*meridian.T)
-    sine, cosine = -meridian[:, 0] / length, meridian[:, 1] / length
-    rotation = np.zeros((len(points), 3, 3))
-    rotation[:, 0, 0] = rotation[:, 1, 1] = cosine
-    rotation[:, 0, 1], rotation[:, 1, 0] = -sine, sine
+    lat, lon = points[:, 0], points[:, 1]
+    ends = np.concatenate((lat + step, lat - step))
+    x, y = _utm(frame.zone, frame.south)(np.concatenate((lon, lon)), ends, radians=True)
+    east, north = x[: len(lat)] - x[len(lat) :], y[: len(lat)] - y[len(lat) :]
+    length = np.hypot(east, north)
+    rotation = np.zeros((len(lat), 3, 3))
+    rotation[:, 0, 0] = rotation[:, 1, 1] = north / length
+    rotation[:, 0, 1], rotation[:, 1, 0] = east / length, -east / length
     rotation[:, 2, 2] = 1.0
-    arc = 2 * step * meridian_radius(points[:, 0])
+    arc = 2 * step * meridian_radius(lat)
     return rotation, length / arc
 
 

@@ -93,15 +93,15 @@ def _check_covariance(label: str, cov: Floats, *, missing: bool = False) -> None
 
 def positive_definite(cov: Floats) -> NDArray[np.bool_]:
     """Which of (N, 3, 3) matrices are finite, symmetric and positive definite, by leading minors: (N,) bool."""
-    finite = np.isfinite(cov).all(axis=(1, 2))
     a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 0, 2]
     d, e, f = cov[:, 1, 1], cov[:, 1, 2], cov[:, 2, 2]
-    tolerance = 1e-6 * np.sqrt(np.abs(np.stack((a * d, a * f, d * f))))
-    skew = np.abs(np.stack((b - cov[:, 1, 0], c - cov[:, 2, 0], e - cov[:, 2, 1])))
-    minor = a * d - b * b
     with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(cov.diagonal(axis1=1, axis2=2))
+        skew = np.abs(cov - cov.transpose(0, 2, 1))  # of what is not finite NaN, which is no less than anything
+        symmetric = (skew <= 1e-6 * sigma[:, :, None] * sigma[:, None, :]).all(axis=(1, 2))
+        minor = a * d - b * b
         determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-        result: NDArray[np.bool_] = finite & (a > 0) & (minor > 0) & (determinant > 0) & (skew <= tolerance).all(axis=0)
+        result: NDArray[np.bool_] = symmetric & (a > 0) & (minor > 0) & (determinant > 0)
     return result
 
 

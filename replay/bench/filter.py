@@ -1,6 +1,6 @@
 """`egoloc bench filter`: IMU steps per second of the whole filter, beside filterpy, gtsam and pyins in the same run.
 
-In stamp order and, by turns, in arrival order: positions come 50 ms late, pose fixes 120 ms, wheel speeds 10 ms.
+In stamp order and, by turns with it, in arrival order: positions come 50 ms late, pose fixes 120, wheel speeds 10 ms.
 
 One simulated drive: 100 Hz IMU, 10 Hz GNSS positions, 10 Hz pose fixes. egoloc's figures are whole calls of
 ``fusion.run`` (covariances, sorting, alignment, gates, recording included) over all of it. The peers get less to do,

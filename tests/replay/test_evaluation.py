@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from fusion.config import FusionConfig
 from fusion.result import Sensor
 from replay.config import HideGnss, RunConfig
 from replay.drive import Drive
@@ -14,6 +15,7 @@ from replay.references import Excluded
 from sensors.records import GnssStatus, Log, Tags, Trajectory
 from sensors.simulate.drive import simulate
 from sensors.simulate.scenarios import load
+from tests.fusion.arrivals import scattered
 from tests.replay.cutting import cut_at, equal, random_edges, rows_of
 
 S = 1_000_000_000
@@ -105,7 +107,13 @@ def with_delays(log: Log) -> Log:
     return replace(log, vehicle=msgspec.structs.replace(log.vehicle, gnss_delay_s=0.3, gnss_velocity_delay_s=0.1))
 
 
+def out_of_order(log: Log) -> Log:
+    """Fixes and pose fixes up to 1.3 s late, whose history is a second."""
+    return scattered(log, 9, 1.3, ("gnss", "gnss_velocity", "pose_fixes"))
+
+
 HIDE = {"hide_gnss": HideGnss(60.0, 15.0)}
+ARRIVAL = {"fusion": FusionConfig(order="arrival")}
 CASES = {
     "plain": (lambda log: log, {}),
     "tags": (with_tags, {}),
@@ -124,6 +132,11 @@ CASES = {
     "hidden often": (with_delays, {"hide_gnss": HideGnss(7.0, 3.3)}),
     "hidden, GNSS ends": (gnss_until(400.0), HIDE),
     "hidden, GNSS pauses": (gnss_until(130.0, 800.0), HIDE),
+    "arrival": (with_tags, ARRIVAL),
+    "arrival, out of order": (out_of_order, ARRIVAL),
+    "arrival, delays": (with_delays, ARRIVAL),
+    "arrival, never aligned": (never_aligned, ARRIVAL),
+    "arrival, hidden": (out_of_order, HIDE | ARRIVAL),
 }
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
+from fusion.config import FusionConfig
 from replay.batch import Job
 from replay.campaign import backend_of, run_campaign
 from replay.config import LIMITS, HideGnss, RunConfig
@@ -16,7 +17,7 @@ from replay.sources import parse
 from replay.store import Keep
 from tests.replay import oracle
 
-LEAST_S = {"plain": 10.0, "hidden": 4.5}
+LEAST_S = {"plain": 10.0, "hidden": 4.5, "arrival": 10.0}
 
 
 @pytest.fixture(scope="module", params=LEAST_S)
@@ -25,7 +26,8 @@ def campaign(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     run: Path = tmp_path_factory.mktemp(request.param) / "run"
     hide = HideGnss(20.0, 5.0) if request.param == "hidden" else None
     drives = parse("scenario:road-test,drives=3,length_km=1")
-    run_campaign(drives, run, Job(RunConfig(hide_gnss=hide), Keep()), backend_of(len(drives), workers=1))
+    fusion = FusionConfig(order="arrival" if request.param == "arrival" else "stamp")
+    run_campaign(drives, run, Job(RunConfig(fusion=fusion, hide_gnss=hide), Keep()), backend_of(len(drives), workers=1))
     return run, LEAST_S[request.param]
 
 
