@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from fusion._linalg import Vector, attitude, axpy, blend, matvec
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
-from fusion.gating import correct, innovate, observed_directions, whiten
+from fusion.gating import correct, innovate, whiten
 from fusion.measurements import gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
-from fusion.modes import observed_without
+from fusion.modes import observe
 from fusion.motion import clear, motion
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
@@ -28,12 +28,9 @@ _GNSS_VELOCITY = int(Sensor.GNSS_VELOCITY)
 _GNSS_YAW = int(Sensor.GNSS_YAW)
 _POSE_FIX = int(Sensor.POSE_FIX)
 _ACCEPTED = int(Reason.ACCEPTED)
-_PARTLY = int(Reason.PARTLY_ACCEPTED)
 _CHI_SQUARE = int(Reason.CHI_SQUARE)
-_COVARIANCE = int(Reason.COVARIANCE)
 _RECEIVER = int(Reason.RECEIVER)
 _MODES_AGREE = int(Reason.MODES_AGREE)
-_MULTI_MODAL = int(Reason.MULTI_MODAL)
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
@@ -204,12 +201,11 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
             _record(rec, e, kind, 0, accepted)
             return
     k = _record(rec, e, kind, dof, _CHI_SQUARE)
+    threshold = threshold_of(core, par, dof, ev.t[e]) if kind == _POSE_FIX else par.gate[dof - 1]
+    passed = _apply(core, rec, par, k, dof, threshold, accepted)
     if kind not in (_GNSS_POSITION, _POSE_FIX):
-        _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
         return
     which = int(kind == _POSE_FIX)
-    threshold = threshold_of(core, par, dof, ev.t[e]) if which else par.gate[dof - 1]
-    passed = _apply(core, rec, par, k, dof, threshold, accepted)
     if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
         tally(core, which, passed, ev.t[e])
     if dof == 3:
@@ -261,7 +257,7 @@ def _measure(core: Core, par: Parameters, m: Measurements, kind: int, row: int, 
 
 @kernel(inline="always")
 def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> tuple[int, int]:
-    """Pose fix in vehicle axes; directions that the histogram does not observe are dropped."""
+    """Pose fix in vehicle axes; directions that the histogram does not observe are dropped (``fusion.modes``)."""
     R, nav, cov = core.R, core.nav, m.pose_cov
     r = attitude(nav)
     c, s = heading(r)
@@ -278,20 +274,9 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int) -> tup
     R[0, 2] = R[2, 0] = c * ey + s * ny
     R[1, 2] = R[2, 1] = c * ny - s * ey
     R[2, 2] = cov[row, 2, 2]
-    limits = par.pose_limits
-    trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
-    if trace <= 1.0:  # then every eigenvalue is
-        return 3, _ACCEPTED
-    a, b, turn = m.pose_spread[row, 0], m.pose_spread[row, 1], m.pose_spread[row, 2]
-    alone = 0  # directions that are observed if there is one mode only
-    if a != 0.0 or b != 0.0 or turn != 0.0:
-        alone = observed_without(R, (c * a + s * b, c * b - s * a, turn), limits, core.eigen)
-    kept = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
-    if kept == 3:
-        return 3, _ACCEPTED
-    if kept == 0 or not par.pose_partial:
-        return 0, _MULTI_MODAL if kept < alone else _COVARIANCE
-    return kept, _MODES_AGREE if kept < alone else _PARTLY
+    a, b, turn = _triple(m.pose_spread, row)
+    observed: tuple[int, int] = observe(core, par.pose_limits, par.pose_partial, (c * a + s * b, c * b - s * a, turn))
+    return observed
 
 
 @kernel(inline="always")
