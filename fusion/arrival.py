@@ -9,7 +9,7 @@ were made when a measurement was first applied. Met again, a measurement is gate
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion._kernels import _record, sweep
+from fusion._kernels import sweep
 from fusion.events import AGAIN, MOTION, OUTPUT, Events, Parameters, Recorder
 from fusion.history import (
     I_ARRIVAL,
@@ -37,6 +37,7 @@ from fusion.history import (
 from fusion.result import Reason
 from fusion.snapshots import S_FIRST, S_NEWEST, restore, snapshot_before
 from fusion.state import C_COUNT, C_STATE, Core, Floats, Nanoseconds
+from fusion.update import record_decision
 from sensors.kernel import kernel
 
 FOREVER = 2**63 - 1
@@ -164,7 +165,7 @@ def _admit(core: Core, history: History, j: int, rec: Recorder, stamps: Nanoseco
                 mark[M_NEXT] += 1
             return t if late else FOREVER
         verdict = _DUPLICATE
-    k = _record(rec, -1, new[I_KIND], 0, verdict)
+    k = record_decision(rec, -1, new[I_KIND], 0, verdict)
     stamps[k, 0], stamps[k, 1], stamps[k, 2] = t, new[I_ARRIVAL], new[I_LOG_ROW]
     _release(history, new[I_ROW])
     return FOREVER
@@ -241,7 +242,7 @@ def _make_room(core: Core, history: History, rec: Recorder, stamps: Nanoseconds)
         core.saves[S_FIRST] += 1
     for e in range(met, count):
         if events.kind[e] < MOTION:
-            k = _record(rec, -1, events.kind[e], 0, _OUTSIDE_IMU)
+            k = record_decision(rec, -1, events.kind[e], 0, _OUTSIDE_IMU)
             stamps[k, 0], stamps[k, 1], stamps[k, 2] = events.t[e], history.arrival_ns[e], history.log_row[e]
     mark[M_NEXT] = max(mark[M_NEXT], count)
     _remove(history, 0, count)

@@ -7,11 +7,18 @@ R the covariance gate drops the direction in which they differ, and keeps the ax
 import numpy as np
 
 from fusion._linalg import Vector
-from fusion.gating import diagonalize
-from fusion.state import Floats
+from fusion.gating import diagonalize, observed_directions
+from fusion.result import Reason
+from fusion.state import Core, Floats
 from sensors.kernel import kernel
 from sensors.records import PoseFix
 from sensors.rotation import wrap
+
+_ACCEPTED = int(Reason.ACCEPTED)
+_PARTLY = int(Reason.PARTLY_ACCEPTED)
+_COVARIANCE = int(Reason.COVARIANCE)
+_MODES_AGREE = int(Reason.MODES_AGREE)
+_MULTI_MODAL = int(Reason.MULTI_MODAL)
 
 
 def spread_of(fixes: PoseFix) -> Floats:
@@ -50,3 +57,25 @@ def observed_without(R: Floats, spread: Vector, limits: Vector, eigen: Floats) -
         if eigen[0, k, k] <= 1.0:
             kept += 1
     return kept
+
+
+@kernel()
+def observe(core: Core, limits: Vector, partial: bool, spread: Vector) -> tuple[int, int]:
+    """Covariance gate of the pose fix in core.residual, H and R (along, left, yaw), reduced to what it observes.
+
+    partial: use the observed directions where others are not; spread: of two modes, which is in R. Returns how many
+    directions are left, and the Reason to record where they pass the other gates, or why none is left.
+    """
+    R = core.R
+    trace = R[0, 0] / limits[0] ** 2 + R[1, 1] / limits[1] ** 2 + R[2, 2] / limits[2] ** 2
+    if trace <= 1.0:  # then every eigenvalue is
+        return 3, _ACCEPTED
+    alone = 0  # directions that one mode would leave
+    if spread[0] != 0.0 or spread[1] != 0.0 or spread[2] != 0.0:
+        alone = observed_without(R, spread, limits, core.eigen)
+    kept = observed_directions(core.H, R, core.residual, limits, core.eigen, core.W)
+    if kept == 3:
+        return 3, _ACCEPTED
+    if kept == 0 or not partial:
+        return 0, _MULTI_MODAL if kept < alone else _COVARIANCE
+    return kept, _MODES_AGREE if kept < alone else _PARTLY

@@ -254,5 +254,6 @@ def pose_columns(
     stated = (fixes.cov + quantization) * model.inflation
     cov = _floor(transform @ stated @ transform.transpose(0, 2, 1), floors)
     spread = np.einsum("nij,nj->ni", transform, spread_of(fixes)) if model.modes else np.zeros((n, 3))
-    cov += spread[:, :, None] * spread[:, None, :]
+    if spread.any():
+        cov += spread[:, :, None] * spread[:, None, :]
     return llh, yaw, tilt, cov, spread

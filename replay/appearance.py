@@ -12,9 +12,11 @@ STATUS_COLOURS = dict(zip(STATUS, (0x7A2E2EFF, 0xC0453CFF, 0xC77F2CFF, 0xBFAE35F
 GATE_COLOURS = {
     "accepted": 0x3F8A48FF,
     "partly_accepted": 0x8DA83AFF,
+    "modes_agree": 0x5FA88AFF,
     "used_for_alignment": 0x3B6FB5FF,
     "chi_square": 0xC0453CFF,
     "covariance": 0xC77F2CFF,
+    "multi_modal": 0xB5622FFF,
     "status": 0xA06A2AFF,
     "receiver": 0x9A4F6EFF,
 }

@@ -133,7 +133,7 @@ def draw_innovations(canvas: Canvas, run: RunColumns, style: Style) -> None:
         _by_fate(canvas, f"nis/{sensor}", t, rows["nis"], passed, colour, style.label)
         canvas.steps(f"nis/{sensor}/threshold", t, rows["threshold"], f"gate{style.label}", LIMIT)
         # of partly accepted pose fixes the components are not axes but kept directions, in units of the gate
-        whole = rows["reason"] != run.code("partly_accepted")
+        whole = ~np.isin(rows["reason"], [run.code(reason) for reason in ("partly_accepted", "modes_agree")])
         for i, (_, scale) in enumerate(INNOVATIONS.get(sensor, ())):
             path = f"innovation/{sensor}/{i}"
             value, sigma = (scale * np.where(whole, rows[f"{name}_{i}"], np.nan) for name in VALUES)

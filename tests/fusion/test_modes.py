@@ -10,10 +10,11 @@ from fusion.config import FusionConfig, PoseModel
 from fusion.gating import observed_directions
 from fusion.modes import observed_without, spread_of
 from fusion.result import Reason, Sensor
-from fusion.run import run
+from fusion.run import Session, joined, run
 from fusion.sources import pose_columns
 from fusion.state import ROW
 from sensors.geodesy import MapFrame
+from sensors.pieces import cut
 from sensors.records import Log, PoseFix
 from sensors.rotation import wrap
 from sensors.simulate import scenarios
@@ -190,3 +191,13 @@ def test_a_flat_histogram_is_not_observed_whatever_the_inflation(log: Log, infla
     fixes = np.flatnonzero(result.decisions.sensor == Sensor.POSE_FIX)
     assert (result.decisions.reason[fixes[ROWS]] == Reason.PARTLY_ACCEPTED).all()
     assert (result.decisions.dof[fixes[ROWS]] == 1).all()
+
+
+def test_modes_in_pieces_give_the_same_bits(log: Log) -> None:
+    given = with_modes(log, (6.0, 0.0), 0.7, wrong_first=True)
+    whole, session = run(given), Session(given.vehicle, given.map_frame)
+    parts = joined([*(session.push(piece) for piece in cut(given, 3.7)), session.finish()])
+    assert (parts.states.llh == whole.states.llh).all()
+    for name in ("reason", "weight", "innovation"):
+        np.testing.assert_array_equal(getattr(parts.decisions, name), getattr(whole.decisions, name))
+    assert (whole.decisions.reason == Reason.MODES_AGREE).sum() == len(ROWS)

@@ -1,0 +1,151 @@
+"""What happens at an event: a measurement is judged and corrects the state, or the state is recorded."""
+
+import math
+
+import numpy as np
+
+from fusion._linalg import Vector, attitude
+from fusion.blocks import renew
+from fusion.covariance import propagate
+from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
+from fusion.gating import correct, innovate, whiten
+from fusion.measurements import heading
+from fusion.motion import motion
+from fusion.observing import measure, triple
+from fusion.recovery import believed, doubted, in_doubt
+from fusion.result import Reason, Sensor
+from fusion.robust import reweigh
+from fusion.state import ROW, Core
+from fusion.streak import tally, threshold_of
+from sensors.kernel import kernel
+
+_GNSS_POSITION = int(Sensor.GNSS_POSITION)
+_GNSS_VELOCITY = int(Sensor.GNSS_VELOCITY)
+_POSE_FIX = int(Sensor.POSE_FIX)
+_ACCEPTED = int(Reason.ACCEPTED)
+_CHI_SQUARE = int(Reason.CHI_SQUARE)
+_RECEIVER = int(Reason.RECEIVER)
+_MODES_AGREE = int(Reason.MODES_AGREE)
+
+
+@kernel(inline="always")
+def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Events, e: int, rate: Vector) -> None:
+    """Apply or record event e at the state's time; rate: bias-free body rate, rad/s."""
+    kind = ev.kind[e]
+    if ev.verdict[e] >= 0:
+        record_decision(rec, e, kind, 0, ev.verdict[e])
+        return
+    if core.P.shape[0] > ROW:
+        age(core, core.span[0])
+    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+    if kind == OUTPUT:
+        record_state(core, rec, ev.t[e])
+        return
+    accepted = _ACCEPTED
+    if kind == MOTION:
+        kind, dof = motion(core, par, ev.t[e], rate)
+        if dof == 0:
+            return
+    elif kind == _GNSS_VELOCITY and in_doubt(core, 0, ev.t[e]):
+        record_decision(rec, e, kind, 0, _RECEIVER)
+        return
+    else:
+        dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
+        if dof == 0:
+            record_decision(rec, e, kind, 0, accepted)
+            return
+    k = record_decision(rec, e, kind, dof, _CHI_SQUARE)
+    if kind not in (_GNSS_POSITION, _POSE_FIX):
+        _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
+        return
+    which = int(kind == _POSE_FIX)
+    threshold = threshold_of(core, par, dof, ev.t[e]) if which else par.gate[dof - 1]
+    passed = _apply(core, rec, par, k, dof, threshold, accepted)
+    first = par.layout.pose_error if which else par.layout.gnss_error
+    if not passed and first >= 0:  # what lasted may have changed all at once: then the state need not move for it
+        dof, accepted = measure(core, par, m, kind, ev.row[e], rate, False)
+        known = innovate(core.P, core.H, core.W, dof, core.R, core.L)
+        if known and whiten(dof, core.residual, core.L) <= threshold:
+            renew(core.nav, core.P, first)
+            dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
+            passed = _apply(core, rec, par, k, dof, threshold, accepted)
+    if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
+        tally(core, which, passed, ev.t[e])
+    if dof == 3:
+        if passed:
+            believed(core, which, ev.t[e])
+        elif kind == _POSE_FIX:
+            doubted(core, par, 1, triple(rec.innovation, k), heading(attitude(core.nav)), ev.t[e])
+        else:
+            doubted(core, par, 0, triple(rec.innovation, k), (1.0, 0.0), ev.t[e])
+
+
+@kernel(inline="always")
+def _apply(core: Core, rec: Recorder, par: Parameters, k: int, dof: int, threshold: float, accepted: int) -> bool:
+    """Gate the core's residual and correct the state; complete decision k. Whether it passed."""
+    L, residual = core.L, core.residual
+    rec.scores[k, 1] = threshold
+    rec.scores[k, 2] = rec.scores[k, 3] = rec.scores[k, 4] = 0.0
+    for i in range(dof):
+        rec.innovation[k, i] = residual[i]
+    if not innovate(core.P, core.H, core.W, dof, core.R, L):
+        return False
+    for i in range(dof):
+        total = 0.0
+        for j in range(i + 1):
+            total += L[i, j] * L[i, j]
+        rec.sigma[k, i] = np.sqrt(total)
+    score = whiten(dof, residual, L)
+    rec.scores[k, 0] = score
+    if not score <= threshold:
+        return False
+    weight = 1.0
+    if par.robust:
+        weight = reweigh(
+            core.P, core.H, core.W, dof, core.R, L, residual, rec.innovation, k, par.robust, par.robust_sigmas, core.dx
+        )  # fmt: skip
+    correct(core.nav, core.earth, core.P, core.W, core.dx, residual, dof)
+    dx = core.dx
+    rec.reason[k] = accepted
+    rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
+    rec.scores[k, 3] = abs(dx[8])
+    rec.scores[k, 4] = weight
+    return True
+
+
+@kernel(inline="always")
+def record_decision(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> int:
+    """Open a decision; returns its row."""
+    k = int(rec.filled[1])
+    rec.filled[1] = k + 1
+    rec.event[k], rec.sensor[k], rec.dof[k], rec.reason[k] = event, sensor, dof, reason
+    for i in range(3):
+        rec.innovation[k, i] = rec.sigma[k, i] = np.nan
+    for i in range(5):
+        rec.scores[k, i] = np.nan
+    return k
+
+
+@kernel(inline="always")
+def record_state(core: Core, rec: Recorder, t: int) -> None:
+    """Record nav, the pose covariance (position, attitude) and every sigma."""
+    P = core.P
+    k = rec.filled[0]
+    rec.filled[0] = k + 1
+    rec.t[k] = t
+    for i in range(16):
+        rec.nav[k, i] = core.nav[i]
+    for i in range(15):
+        rec.sigma_state[k, i] = np.sqrt(P[i, i])
+    for i in range(6):
+        a = i if i < 3 else i + 3
+        for j in range(6):
+            b = j if j < 3 else j + 3
+            rec.pose_cov[k, i, j] = P[a, b]
+
+
+@kernel(inline="always")
+def age(core: Core, dt: float) -> None:
+    """Time and road go by for the errors that last."""
+    core.aged[0] += dt
+    core.aged[1] += dt * math.sqrt(core.nav[3] * core.nav[3] + core.nav[4] * core.nav[4])
