@@ -11,12 +11,13 @@ from fusion._linalg import Vector, attitude, axpy, blend, matvec
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
+from fusion.health import SOURCES, hopeless, judge, level_of, noted
 from fusion.measurements import gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
-from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, Core, Floats
+from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, H_CAUSE, H_STATE, RING_SIZE, Core, Floats
 from sensors._kernels import radii
 from sensors.kernel import kernel
 
@@ -29,6 +30,7 @@ _PARTLY = int(Reason.PARTLY_ACCEPTED)
 _CHI_SQUARE = int(Reason.CHI_SQUARE)
 _COVARIANCE = int(Reason.COVARIANCE)
 _RECEIVER = int(Reason.RECEIVER)
+_SOURCES = len(SOURCES)
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
@@ -52,6 +54,7 @@ def process(
 ) -> int:
     """Run IMU samples and all events up to the last of them; return the index of the first event not reached.
 
+    A position that finds the filter hopeless (``fusion.health``) is not reached, and nothing after it.
     Events lie at or after the state's time. Between two samples the signals are curves, so an event is met at its own
     time, not at a sample's.
     """
@@ -89,6 +92,8 @@ def process(
                 continue
             if e >= events or ev.t[e] > stop:
                 break
+            if ev.verdict[e] < 0 and hopeless(core, par.health, ev.kind[e], stop):
+                return e
             rate = blend(interval[0], interval[1], (stop - start) / whole) if whole > 0 else w
             if not (gap and ev.kind[e] == MOTION):  # the rate in a gap is a guess
                 _handle(core, rec, par, m, ev, e, axpy(-1.0, (nav[10], nav[11], nav[12]), rate))
@@ -183,7 +188,7 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
         return
     propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
     if kind == OUTPUT:
-        _record_state(core, rec, ev.t[e])
+        _record_state(core, rec, par, ev.t[e])
         return
     accepted = _ACCEPTED
     if kind == MOTION:
@@ -192,6 +197,7 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
             return
     elif kind == _GNSS_VELOCITY and in_doubt(core, 0, ev.t[e]):
         _record(rec, e, kind, 0, _RECEIVER)
+        noted(core, par.health, kind, 3, np.inf, False, ev.t[e])
         return
     else:
         dof = _measure(core, par, m, kind, ev.row[e], rate)
@@ -202,6 +208,8 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
             accepted = _PARTLY
     k = _record(rec, e, kind, dof, _CHI_SQUARE)
     passed = _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
+    if kind < _SOURCES:
+        noted(core, par.health, kind, dof, rec.scores[k, 0], passed, ev.t[e])
     if kind in (_GNSS_POSITION, _POSE_FIX) and dof == 3:
         if passed:
             believed(core, int(kind == _POSE_FIX))
@@ -314,8 +322,8 @@ def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> in
 
 
 @kernel(inline="always")
-def _record_state(core: Core, rec: Recorder, t: int) -> None:
-    """Record nav, the pose covariance (position, attitude) and every sigma."""
+def _record_state(core: Core, rec: Recorder, par: Parameters, t: int) -> None:
+    """Record nav, the pose covariance (position, attitude), every sigma, and how the filter is doing."""
     P = core.P
     k = rec.filled[0]
     rec.filled[0] = k + 1
@@ -329,3 +337,7 @@ def _record_state(core: Core, rec: Recorder, t: int) -> None:
         for j in range(6):
             b = j if j < 3 else j + 3
             rec.pose_cov[k, i, j] = P[a, b]
+    judge(core, par.health, t)
+    rec.health[k, 0], rec.health[k, 1] = core.health[H_STATE], core.health[H_CAUSE]
+    for sensor in range(_SOURCES):
+        rec.levels[k, sensor] = level_of(core, par.health, sensor, t)

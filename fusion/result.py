@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,8 @@ class States:
 
     llh (N, 3); vel_enu (N, 3) m/s; q_enu_body (N, 4) xyzw; gyro_bias (N, 3) rad/s; accel_bias (N, 3) m/s^2;
     pose_cov (N, 6, 6): position ENU m, attitude (left error, ENU) rad; sigma (N, 15): standard deviation of the whole
-    error state: position ENU m, velocity ENU m/s, attitude rad, gyro bias rad/s, accelerometer bias m/s^2.
+    error state: position ENU m, velocity ENU m/s, attitude rad, gyro bias rad/s, accelerometer bias m/s^2; health,
+    cause (N,) and levels (N, 5) of each sensor, int8: Health, Cause and Level of ``fusion.health``.
     """
 
     t_ns: NDArray[np.int64]
@@ -63,6 +65,9 @@ class States:
     accel_bias: Floats
     pose_cov: Floats
     sigma: Floats
+    health: NDArray[np.int8]
+    cause: NDArray[np.int8]
+    levels: NDArray[np.int8]
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -93,11 +98,21 @@ class Decisions:
     moved_yaw: Floats
 
 
+class Restart(NamedTuple):
+    """The filter diverged (Cause of ``fusion.health``) and was aligned anew from t_ns on; whether it succeeded shows in
+    the decisions."""
+
+    t_ns: int
+    cause: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FusionResult:
-    """States, decisions, the time of the first state (None: never aligned, states are empty) and what was left out."""
+    """States, decisions, the time of the first state (None: never aligned, states are empty), what was left out, and
+    when the filter was started again."""
 
     states: States
     decisions: Decisions
     aligned_ns: int | None
     left_out: Sequence[LeftOut] = ()
+    restarts: Sequence[Restart] = ()

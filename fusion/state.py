@@ -58,6 +58,17 @@ G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8
 # entries of Core.doubt_clock
 D_COUNT, D_TIME, D_AGREED = range(3)
 
+# entries of Core.health: Health and Cause; when the core was aligned, a position was applied, one was explained, the
+# filter came back, the yaw was last known worse than linear; positions not explained since, the first and the last of
+# them; how often it was aligned anew
+H_STATE, H_CAUSE, H_START, H_FED, H_HELD, H_BACK, H_WIDE, H_COUNT, H_SINCE, H_LAST, H_RESTARTS = range(11)
+
+# columns of Core.trust: when a measurement was last judged, last explained; how many more were not than were
+T_SEEN, T_GOOD, T_DOUBT = range(3)
+
+NEVER = -(2**62)
+"""Before any stamp."""
+
 # entries of Core.clock
 C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)
 
@@ -73,6 +84,7 @@ class Core(NamedTuple):
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
     doubt (2, 8), doubt_clock (2, 3) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
+    health (11,), trust (5, 3) int64: clocks of ``fusion.health`` (H_*, T_*).
     phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
     """
@@ -89,6 +101,8 @@ class Core(NamedTuple):
     quietest: Floats
     doubt: Floats
     doubt_clock: Nanoseconds
+    health: Nanoseconds
+    trust: Nanoseconds
     phi: Floats
     M: Floats
     Mt: Floats
@@ -116,6 +130,8 @@ def new_core() -> Core:
         quietest=np.full(2, np.inf),
         doubt=np.zeros((2, 8)),
         doubt_clock=np.zeros((2, 3), np.int64),
+        health=np.array([0, 0, *(NEVER,) * 5, 0, NEVER, NEVER, 0], np.int64),
+        trust=np.tile(np.array([NEVER, NEVER, 0], np.int64), (5, 1)),
         phi=np.zeros((9, ROW)),
         M=np.zeros((9, ROW)),
         Mt=np.zeros((ERROR_SIZE, ROW)),
