@@ -119,6 +119,8 @@ _TILTED, _COVARIANCE, _REJECTED = int(Cause.TILTED), int(Cause.COVARIANCE), int(
 _ABSENT, _STALE, _SUSPECT, _GOOD = (int(level) for level in Level)
 _GNSS, _YAW, _POSE = int(Sensor.GNSS_POSITION), int(Sensor.GNSS_YAW), int(Sensor.POSE_FIX)
 _COUNT = len(SOURCES)
+SIGMAS = 3.0
+"""A contradiction of at most so many horizontal sigmas is one that the covariance explains by its size."""
 AGREEMENT = 0.2
 """Two sensors that differ by at most this share of how far the state is off name the same place."""
 
@@ -210,9 +212,53 @@ def _divergence(core: Core, limits: HealthLimits) -> int:
         return _TILTED
     if P[0, 0] + P[1, 1] > limits.blown_var or P[8, 8] > limits.blown_yaw_var:
         return _COVARIANCE
-    if clock[H_COUNT] >= limits.lost and clock[H_LAST] - clock[H_SINCE] >= limits.lost_ns:
-        return _REJECTED
-    return _NONE
+    return _REJECTED if _lost(core, limits) else _NONE
+
+
+@kernel()
+def _lost(core: Core, limits: HealthLimits) -> bool:
+    """Whether positions contradict the state for too long: two sensors, one by far, or one for very long.
+
+    What one sensor says, not far from the state and not for so long, may be a wrong fix or an alias of the map.
+    """
+    clock = core.health
+    lasts = clock[H_LAST] - clock[H_SINCE]
+    if clock[H_COUNT] < limits.lost or lasts < limits.lost_ns:
+        return False
+    both = _heard(core, _GNSS) and _heard(core, _POSE)
+    return both or lasts >= limits.alone_ns or _off(core) > limits.far_m or _doubtful(core, limits)
+
+
+@kernel()
+def _weak(core: Core, limits: HealthLimits) -> bool:
+    """Whether the state says little: nothing held it for long, or its yaw was beyond what linear updates can mend."""
+    clock = core.health
+    unheld: bool = clock[H_LAST] - clock[H_HELD] >= limits.alone_ns
+    return unheld or clock[H_SINCE] - clock[H_WIDE] <= limits.lost_ns
+
+
+@kernel()
+def _doubtful(core: Core, limits: HealthLimits) -> bool:
+    """Whether a weak state's own sigma explains the size of the contradiction, if not its direction."""
+    size = _off(core)
+    return _weak(core, limits) and size * size <= SIGMAS * SIGMAS * (core.P[0, 0] + core.P[1, 1])
+
+
+@kernel()
+def _heard(core: Core, sensor: int) -> bool:
+    """Whether positions of this sensor are among those that were not explained of late."""
+    heard: bool = core.trust[sensor, T_SEEN] >= core.health[H_SINCE]
+    return heard
+
+
+@kernel()
+def _off(core: Core) -> float:
+    """How far off the state is by the sensor that says least, m."""
+    least = math.inf
+    for which, sensor in ((0, _GNSS), (1, _POSE)):
+        if _heard(core, sensor):
+            least = min(least, math.hypot(core.doubt[which, 0], core.doubt[which, 1]))
+    return least
 
 
 @kernel()
@@ -232,7 +278,7 @@ def hopeless(core: Core, limits: HealthLimits, sensor: int, now: int) -> bool:
     Not the second time within a pause that grows with each start, and not because of one sensor's word, unless the
     state has been without any other for so long, or so uncertain in yaw, that it weighs less.
     """
-    clock, trust = core.health, core.trust
+    clock = core.health
     if sensor not in (_GNSS, _POSE) or not limits.restart:
         return False
     if now - clock[H_START] < limits.pause_ns * (1 + clock[H_RESTARTS]):
@@ -242,21 +288,15 @@ def hopeless(core: Core, limits: HealthLimits, sensor: int, now: int) -> bool:
         return False
     if clock[H_CAUSE] != _REJECTED:
         return True
-    heard = (trust[_GNSS, T_SEEN] >= clock[H_SINCE], trust[_POSE, T_SEEN] >= clock[H_SINCE])
-    gnss, pose = core.doubt[0], core.doubt[1]
-    off = math.inf
-    if heard[0]:
-        off = min(off, math.hypot(gnss[0], gnss[1]))
-    if heard[1]:
-        off = min(off, math.hypot(pose[0], pose[1]))
-    if heard[0] and heard[1]:
-        apart = math.hypot(gnss[0] - pose[0], gnss[1] - pose[1])
-        return off > limits.far_m and apart <= AGREEMENT * off
-    weak = now - clock[H_HELD] >= limits.alone_ns or clock[H_SINCE] - clock[H_WIDE] <= limits.lost_ns
-    if not weak:
+    far = _off(core) > limits.far_m
+    if _heard(core, _GNSS) and _heard(core, _POSE):
+        gnss, pose = core.doubt[0], core.doubt[1]
+        return far and math.hypot(gnss[0] - pose[0], gnss[1] - pose[1]) <= AGREEMENT * _off(core)
+    far_and_weak = far and _weak(core, limits)
+    if sensor == _POSE:
+        return far_and_weak  # nearer, an alias of the map looks the same
+    if not far_and_weak and not _doubtful(core, limits) and clock[H_LAST] - clock[H_SINCE] < limits.alone_ns:
         return False
-    if heard[1]:
-        return off > limits.far_m  # nearer, an alias of the map looks the same
     nav = core.nav
     moving = nav[3] * nav[3] + nav[4] * nav[4] >= limits.course_speed2
     return moving or level_of(core, limits, _YAW, now) > _STALE
