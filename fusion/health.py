@@ -67,12 +67,12 @@ class Cause(IntEnum):
     """The state is not finite, or a variance not a number above zero."""
     TOO_FAST = 8
     """Faster than any land vehicle."""
-    TILTED = 9
-    """A land vehicle on its side."""
-    COVARIANCE = 10
+    COVARIANCE = 9
     """Position or yaw is not known at all."""
-    REJECTED = 11
+    REJECTED = 10
     """No position was explained by the state for long."""
+    TILTED = 11
+    """A land vehicle on its side: the IMU's axes are others."""
 
 
 class Level(IntEnum):
@@ -176,9 +176,9 @@ def level_of(core: Core, limits: HealthLimits, sensor: int, now: int) -> int:
 @kernel()
 def judge(core: Core, limits: HealthLimits, now: int) -> None:
     """Bring the state of health and its cause up to now."""
-    clock, P = core.health, core.P
+    clock = core.health
     before = clock[H_STATE]
-    if P[8, 8] > limits.wide_yaw_var:
+    if core.P[8, 8] > limits.wide_yaw_var:
         clock[H_WIDE] = now
     cause = _divergence(core, limits)
     if cause != _NONE:
@@ -208,11 +208,11 @@ def _divergence(core: Core, limits: HealthLimits) -> int:
             return _NOT_FINITE
     if nav[3] * nav[3] + nav[4] * nav[4] + nav[5] * nav[5] > limits.max_speed2:
         return _TOO_FAST
-    if attitude(nav)[8] < limits.least_upright:
-        return _TILTED
     if P[0, 0] + P[1, 1] > limits.blown_var or P[8, 8] > limits.blown_yaw_var:
         return _COVARIANCE
-    return _REJECTED if _lost(core, limits) else _NONE
+    if _lost(core, limits):
+        return _REJECTED
+    return _TILTED if attitude(nav)[8] < limits.least_upright else _NONE
 
 
 @kernel()
@@ -284,7 +284,7 @@ def hopeless(core: Core, limits: HealthLimits, sensor: int, now: int) -> bool:
     if now - clock[H_START] < limits.pause_ns * (1 + clock[H_RESTARTS]):
         return False
     judge(core, limits, now)
-    if clock[H_STATE] != _DIVERGED:
+    if clock[H_STATE] != _DIVERGED or clock[H_CAUSE] == _TILTED:  # tilted by gravity: it would be again
         return False
     if clock[H_CAUSE] != _REJECTED:
         return True
