@@ -181,7 +181,7 @@ class HealthModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     restart_pause_s: NonNegative = 10.0
     """Not within so long after a start, times the number of starts: what is wrong may be the IMU, s."""
     alone_s: Positive = 60.0
-    """One sensor alone, against which nothing else speaks, is believed after so long without an explained position, s."""
+    """One sensor alone weighs more than a state that no explained position has held for so long, s."""
     wide_sigma_yaw_deg: Positive = 10.0
     """Or at once where the yaw was known worse than this just before: updates are no longer linear, deg."""
     far_m: Positive = 10.0

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fusion._linalg import Vector
 from fusion.covariance import Noise
-from fusion.health import HealthLimits
+from fusion.divergence import HealthLimits
 from fusion.state import Floats
 
 MOTION = 100

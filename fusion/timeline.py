@@ -11,8 +11,8 @@ from scipy.special import gammaincinv
 
 from fusion.config import FusionConfig, check
 from fusion.covariance import Noise
+from fusion.divergence import HealthLimits
 from fusion.events import MOTION, OUTPUT, Events, Parameters
-from fusion.health import HealthLimits
 from fusion.sources import APPLY, Sources
 from sensors.vehicle import ImuSpec, Vehicle
 
