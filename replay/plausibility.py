@@ -85,7 +85,8 @@ class Watch:
         for cause, stretches in self.health.diverged.items():
             kind, words = DIVERGED[cause]
             start, end = ((t - start_ns) / NS_PER_S for t in (stretches.start_ns, stretches.end_ns))
-            more = f", and {stretches.count - 1} times more" if stretches.count > 1 else ""
+            again = stretches.count - 1
+            more = f", and {again} times more" if again > 1 else ", and once more" if again else ""
             yield kind, f"The filter diverged from {start:.1f} to {end:.1f} s{more}: {words}."
 
     def _restarted(self, start_ns: int) -> str:
