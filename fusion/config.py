@@ -97,6 +97,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Below this speed the non-holonomic update waits, m/s."""
     still_window_s: Positive = 1.0
     """Window over which the IMU must be quiet, s."""
+    still_wait_s: NonNegative = 5.0
+    """So long after a start the vehicle is not taken to stand: its speed is known too badly to tell a creep, s."""
     still_accel: NonNegative = 0.25
     """Largest standard deviation of the acceleration's norm at rest, m/s^2."""
     still_rate_deg: NonNegative = 0.3

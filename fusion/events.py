@@ -41,6 +41,7 @@ class Parameters(NamedTuple):
     per_speed: float
     min_speed: float
     still_window_ns: int
+    still_wait_ns: int
     still_ratio: float
     still_accel_var: float
     still_rate_var: float

@@ -72,6 +72,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         per_speed=motion.sigma_per_speed,
         min_speed=motion.min_speed,
         still_window_ns=round(motion.still_window_s * 1e9),
+        still_wait_ns=round(motion.still_wait_s * 1e9),
         still_ratio=motion.still_ratio,
         still_accel_var=motion.still_accel**2,
         still_rate_var=float(np.radians(motion.still_rate_deg) ** 2),
