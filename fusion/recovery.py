@@ -45,21 +45,25 @@ def in_doubt(core: Core, which: int, now: int) -> bool:
 def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now: int) -> None:
     """A position of sensor which was rejected: innovation z and core.R in axes whose first lies at ahead (cos, sin).
 
-    After so many rejections in a row that agree with the other sensor's, P becomes wide enough for both.
+    After so many rejections in a row that agree with the other sensor's, P becomes wide enough for both. Height has no
+    other sensor than GNSS: where it alone is off after so many, it gives way.
     """
     c, s = ahead
     R, doubt, clock = core.R, core.doubt, core.doubt_clock
     mine, other = doubt[which], doubt[1 - which]
     east, north = c * z[0] - s * z[1], s * z[0] + c * z[1]
+    clock[which, D_COUNT] += 1
+    if which == 0 and clock[0, D_COUNT] >= par.outvoted and _only_height(core, par, z):
+        core.P[2, 2] += z[2] * z[2]
+        core.P[5, 5] += VELOCITY_VAR
     mine[6] = mine[7] = 0.0
-    if clock[which, D_COUNT] > 0 and 0 < now - clock[which, D_TIME] <= FRESH_NS:
+    if clock[which, D_COUNT] > 1 and 0 < now - clock[which, D_TIME] <= FRESH_NS:
         dt = (now - clock[which, D_TIME]) * 1e-9
         mine[6], mine[7] = (east - mine[0]) / dt, (north - mine[1]) / dt
     mine[0], mine[1], mine[2] = east, north, z[2]
     mine[3] = c * c * R[0, 0] - 2.0 * c * s * R[0, 1] + s * s * R[1, 1]
     mine[4] = c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1]
     mine[5] = s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1]
-    clock[which, D_COUNT] += 1
     clock[which, D_TIME] = now
     if clock[1 - which, D_COUNT] == 0 or now - clock[1 - which, D_TIME] > FRESH_NS:
         clock[0, D_AGREED] = 0
@@ -76,6 +80,15 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     if clock[0, D_AGREED] >= par.outvoted:
         _give_way(core.P, doubt)
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
+
+
+@kernel()
+def _only_height(core: Core, par: Parameters, z: Vector) -> bool:
+    """Whether a GNSS position passes in the plane: it is only the height that it contradicts."""
+    P, R = core.P, core.R
+    ee, en, nn = P[0, 0] + R[0, 0], P[0, 1] + R[0, 1], P[1, 1] + R[1, 1]
+    distance = (nn * z[0] * z[0] - 2.0 * en * z[0] * z[1] + ee * z[1] * z[1]) / (ee * nn - en * en)
+    return bool(distance <= par.gate[1])
 
 
 @kernel()
