@@ -11,7 +11,7 @@ from fusion._linalg import Vector, attitude, axpy, blend, matvec
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, observed_directions, whiten
-from fusion.health import SOURCES, hopeless, judge, level_of, noted
+from fusion.health import SOURCES, hopeless, judge, level_of, noted, questionable
 from fusion.measurements import gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.motion import clear, motion
@@ -92,7 +92,13 @@ def process(
                 continue
             if e >= events or ev.t[e] > stop:
                 break
-            if ev.verdict[e] < 0 and hopeless(core, par.health, ev.kind[e], stop):
+            kind = ev.kind[e]
+            if (
+                kind in (_GNSS_POSITION, _POSE_FIX)
+                and ev.verdict[e] < 0
+                and questionable(core.health, core.P, par.health)
+                and hopeless(core, par.health, kind, stop)
+            ):
                 return e
             rate = blend(interval[0], interval[1], (stop - start) / whole) if whole > 0 else w
             if not (gap and ev.kind[e] == MOTION):  # the rate in a gap is a guess
@@ -197,7 +203,7 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
             return
     elif kind == _GNSS_VELOCITY and in_doubt(core, 0, ev.t[e]):
         _record(rec, e, kind, 0, _RECEIVER)
-        noted(core, par.health, kind, 3, np.inf, False, ev.t[e])
+        noted(core.health, core.trust, par.health.suspect, kind, False, False, ev.t[e])
         return
     else:
         dof = _measure(core, par, m, kind, ev.row[e], rate)
@@ -209,7 +215,8 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
     k = _record(rec, e, kind, dof, _CHI_SQUARE)
     passed = _apply(core, rec, k, dof, par.gate[dof - 1], accepted)
     if kind < _SOURCES:
-        noted(core, par.health, kind, dof, rec.scores[k, 0], passed, ev.t[e])
+        explained = passed and rec.scores[k, 0] <= par.health.explained[dof - 1]
+        noted(core.health, core.trust, par.health.suspect, kind, passed, explained, ev.t[e])
     if kind in (_GNSS_POSITION, _POSE_FIX) and dof == 3:
         if passed:
             believed(core, int(kind == _POSE_FIX))
@@ -340,4 +347,4 @@ def _record_state(core: Core, rec: Recorder, par: Parameters, t: int) -> None:
     judge(core, par.health, t)
     rec.health[k, 0], rec.health[k, 1] = core.health[H_STATE], core.health[H_CAUSE]
     for sensor in range(_SOURCES):
-        rec.levels[k, sensor] = level_of(core, par.health, sensor, t)
+        rec.levels[k, sensor] = level_of(core.trust, par.health.stale_ns[sensor], par.health.suspect, sensor, t)

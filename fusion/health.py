@@ -23,6 +23,8 @@ from fusion.state import (
     T_GOOD,
     T_SEEN,
     Core,
+    Floats,
+    Nanoseconds,
 )
 from sensors.kernel import kernel
 
@@ -49,16 +51,19 @@ def begin(core: Core, now: int, before: Core | None) -> None:
 
 
 @kernel()
-def noted(core: Core, limits: HealthLimits, sensor: int, dof: int, score: float, applied: bool, now: int) -> None:
-    """A measurement of one of SOURCES was judged: its NIS (score) with so many degrees of freedom, and its fate."""
-    clock, trust = core.health, core.trust
-    explained = applied and score <= limits.explained[dof - 1]
+def noted(
+    clock: Nanoseconds, trust: Nanoseconds, suspect: int, sensor: int, applied: bool, explained: bool, now: int
+) -> None:
+    """A measurement of one of SOURCES was judged: whether it was applied, and whether the state explains it.
+
+    clock, trust: Core.health and Core.trust.
+    """
     trust[sensor, T_SEEN] = now
     if explained:
         trust[sensor, T_GOOD] = now
         trust[sensor, T_DOUBT] = max(trust[sensor, T_DOUBT] - 1, 0)
     else:
-        trust[sensor, T_DOUBT] = min(trust[sensor, T_DOUBT] + 1, 2 * limits.suspect)
+        trust[sensor, T_DOUBT] = min(trust[sensor, T_DOUBT] + 1, 2 * suspect)
     if sensor not in (_GNSS, _POSE):
         return
     if applied:
@@ -73,14 +78,13 @@ def noted(core: Core, limits: HealthLimits, sensor: int, dof: int, score: float,
 
 
 @kernel()
-def level_of(core: Core, limits: HealthLimits, sensor: int, now: int) -> int:
-    """The Level of one of SOURCES."""
-    trust, stale = core.trust, limits.stale_ns[sensor]
+def level_of(trust: Nanoseconds, stale: int, suspect: int, sensor: int, now: int) -> int:
+    """The Level of one of SOURCES. trust: Core.trust; stale: after so many ns."""
     if trust[sensor, T_SEEN] == trust[sensor, T_GOOD] < 0:
         return _ABSENT
     if now - trust[sensor, T_SEEN] > stale:
         return _STALE
-    if trust[sensor, T_DOUBT] >= limits.suspect or now - trust[sensor, T_GOOD] > stale:
+    if trust[sensor, T_DOUBT] >= suspect or now - trust[sensor, T_GOOD] > stale:
         return _SUSPECT
     return _GOOD
 
@@ -110,29 +114,40 @@ def judge(core: Core, limits: HealthLimits, now: int) -> None:
 def _weakness(core: Core, limits: HealthLimits, now: int) -> int:
     """The Cause for which the state is less than healthy: the first sensor that is not good; NONE."""
     for sensor in range(_COUNT):
-        if _ABSENT < level_of(core, limits, sensor, now) < _GOOD:
+        if _ABSENT < level_of(core.trust, limits.stale_ns[sensor], limits.suspect, sensor, now) < _GOOD:
             return sensor + 1
     P = core.P
     return _SIGMA if P[0, 0] + P[1, 1] > limits.sigma_var or P[8, 8] > limits.sigma_yaw_var else _NONE
+
+
+@kernel(inline="always")
+def questionable(clock: Nanoseconds, P: Floats, limits: HealthLimits) -> bool:
+    """Whether there is any need to ask ``hopeless``: positions of late were not explained, or P is wide."""
+    return bool(clock[H_COUNT] > 0 or P[8, 8] > limits.wide_yaw_var or P[0, 0] + P[1, 1] > limits.blown_var)
 
 
 @kernel()
 def hopeless(core: Core, limits: HealthLimits, sensor: int, now: int) -> bool:
     """Whether a position that comes now should rather begin a new alignment than be judged by this state.
 
-    Not within a pause after a start, which grows with their number; and not for its tilt, which gravity gave it.
+    sensor: GNSS position or pose fix. Not within a pause after a start, which grows with their number; and not for its
+    tilt, which gravity gives again.
     """
-    if sensor not in (_GNSS, _POSE) or not limits.restart:
-        return False
     clock, nav = core.health, core.nav
+    if core.P[8, 8] > limits.wide_yaw_var:
+        clock[H_WIDE] = now
+    if not limits.restart:
+        return False
     if now - clock[H_START] < limits.pause_ns * (1 + clock[H_RESTARTS]):
         return False
-    judge(core, limits, now)
-    if clock[H_STATE] != _DIVERGED or clock[H_CAUSE] == _TILTED:
+    cause = divergence(core, limits)
+    if cause in (_NONE, _TILTED):
         return False
-    if clock[H_CAUSE] != _REJECTED:
+    judge(core, limits, now)
+    if cause != _REJECTED:
         return True
-    has_yaw = sensor == _POSE or level_of(core, limits, _YAW, now) > _STALE  # else the new one will be a course
+    # else the new yaw will be a course
+    has_yaw = sensor == _POSE or level_of(core.trust, limits.stale_ns[_YAW], limits.suspect, _YAW, now) > _STALE
     if not has_yaw and nav[3] * nav[3] + nav[4] * nav[4] < limits.course_speed2:
         return False
     return bool(outweighed(core, limits))
