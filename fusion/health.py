@@ -122,8 +122,9 @@ def _weakness(core: Core, limits: HealthLimits, now: int) -> int:
 
 @kernel(inline="always")
 def questionable(clock: Nanoseconds, P: Floats, limits: HealthLimits) -> bool:
-    """Whether there is any need to ask ``hopeless``: positions of late were not explained, or P is wide."""
-    return bool(clock[H_COUNT] > 0 or P[8, 8] > limits.wide_yaw_var or P[0, 0] + P[1, 1] > limits.blown_var)
+    """Whether there is any need to ask ``hopeless``: positions of late were not explained, or P is wide or NaN."""
+    narrow = P[8, 8] <= limits.wide_yaw_var and P[0, 0] + P[1, 1] <= limits.blown_var
+    return bool(clock[H_COUNT] > 0 or not narrow)
 
 
 @kernel()

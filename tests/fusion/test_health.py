@@ -215,11 +215,13 @@ def test_what_is_not_finite_is_diverged_and_begun_anew(drive: Drive) -> None:
             localizer.core.P[4, 4] = np.nan
     states = localizer.take_states()
     s = seconds(drive.log, states.t_ns)
-    assert np.isfinite(states.pose_cov).all()
+    spoilt = ~np.isfinite(states.pose_cov).all(axis=(1, 2))
+    assert spoilt.sum() <= 1  # an output may come before that position
+    assert (states.cause[spoilt] == Cause.NOT_FINITE).all()
     gap = np.flatnonzero(np.diff(s) > 0.5)
     assert len(gap) == 1
     assert s[gap[0] + 1] - s[gap[0]] < 1.5
-    assert (states.health[(s > s[gap[0]]) & (s < s[gap[0] + 1] + 9.9)] == Health.RECOVERED).all()
+    assert (states.health[(s > s[gap[0]] + 0.05) & (s < s[gap[0] + 1] + 9.9)] == Health.RECOVERED).all()
     assert states.health[-1] == Health.HEALTHY
 
 
