@@ -13,7 +13,7 @@ from fusion.events import AGAIN, MOTION, Events, Measurements, Parameters, Recor
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.snapshots import S_CHANGED, save
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, Core, Floats
-from fusion.update import age, handle
+from fusion.update import age, gives_up, handle
 from sensors._kernels import radii
 from sensors.kernel import kernel
 
@@ -39,6 +39,7 @@ def process(
 ) -> int:
     """Run IMU samples and all events up to the last of them; return the index of the first event not reached.
 
+    A position that finds the filter hopeless (``fusion.health``) is not reached, and nothing after it.
     Events lie at or after the state's time. Between two samples the signals are curves, so an event is met at its own
     time, not at a sample's.
     """
@@ -97,6 +98,8 @@ def sweep(
                 continue
             if e >= events or ev.t[e] > stop:
                 break
+            if not keeps and gives_up(core, par, ev, e, stop):
+                return e
             rate = blend(interval[0], interval[1], (stop - start) / whole) if whole > 0 else w
             guess = gap
             if keeps and stop == start < t:  # after a rewind to the sample before

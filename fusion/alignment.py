@@ -34,6 +34,8 @@ _TOWN_ACCELERATION = 1.2
 """Horizontal acceleration of a car in town, each axis, RMS, m/s^2."""
 _STRAIGHT_RATE = 0.05
 """Turning faster than this is a turn, rad/s."""
+_SLIP_SHARE = 0.25
+"""Tyres slip as well, and the rate is not quite that of the velocity's time: so much of the slip is uncertain."""
 _PATIENCE_NS = 1_000_000_000
 """A pose fix that is contradicted is believed after so long."""
 _HEIGHT_SIGMA_M = 1000.0
@@ -87,7 +89,7 @@ class Aligner:
             return None
         if still:
             self._rest.add(t_ns, window)
-        yaw = self._yaw(t_ns, sensor, row, m)
+        yaw = self._yaw(t_ns, sensor, row, m, window)
         velocity = None if yaw is None else self._velocity(t_ns, still)
         if yaw is None or velocity is None or self._in_turn(sensor, window):
             return None
@@ -126,7 +128,7 @@ class Aligner:
         slow = all(np.linalg.norm(v.value[:2]) < 0.3 + 2.0 * math.sqrt(v.cov[0, 0] + v.cov[1, 1]) for v in seen)
         return slow and bool(seen)
 
-    def _yaw(self, t_ns: int, sensor: int, row: int, m: Measurements) -> Yaw | None:
+    def _yaw(self, t_ns: int, sensor: int, row: int, m: Measurements, window: Window) -> Yaw | None:
         """What this measurement shows of the yaw."""
         if sensor == Sensor.GNSS_YAW:
             return float(m.yaw[row]), float(m.yaw_var[row])
@@ -135,11 +137,14 @@ class Aligner:
             if variance <= self._par.pose_limits[2] ** 2:
                 return float(m.pose_yaw[row]), variance
         if self._velocities and self._velocities[-1].t_ns == t_ns:
-            return self._course(self._velocities[-1])
+            return self._course(self._velocities[-1], window)
         return None
 
-    def _course(self, velocity: Fix) -> Yaw | None:
-        """Direction of motion, where it is fast enough and known well enough."""
+    def _course(self, velocity: Fix, window: Window) -> Yaw | None:
+        """Direction of motion, where it is fast enough and known well enough, less the slip of the antenna.
+
+        In a turn only the rear axle moves along the body: an antenna l ahead of it slips by asin(rate l / speed).
+        """
         limits = self._config
         east, north = velocity.value[:2]
         speed2 = float(east * east + north * north)
@@ -149,7 +154,12 @@ class Aligner:
         variance = float(normal @ velocity.cov[:2, :2] @ normal) / speed2**2
         if variance > math.radians(limits.max_course_sigma_deg) ** 2:
             return None
-        return math.atan2(north, east), variance + math.radians(limits.course_sigma_deg) ** 2
+        slip = 0.0
+        if self._vehicle.land_vehicle:
+            ahead = self._vehicle.gnss_lever_arm[0] - self._vehicle.rear_axle[0]
+            slip = math.asin(float(np.clip(window.latest_rate[2] * ahead / math.sqrt(speed2), -1.0, 1.0)))
+        sigma = math.hypot(math.radians(limits.course_sigma_deg), _SLIP_SHARE * slip)
+        return math.atan2(north, east) - slip, variance + sigma**2
 
     def _in_turn(self, sensor: int, window: Window) -> bool:
         """Whether a course over a baseline lags; it waits for the end of the turn."""

@@ -133,6 +133,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Below this speed the non-holonomic update waits, m/s."""
     still_window_s: Positive = 1.0
     """Window over which the IMU must be quiet, s."""
+    still_wait_s: NonNegative = 5.0
+    """So long after a start the vehicle is not taken to stand: its speed is known too badly to tell a creep, s."""
     still_accel: NonNegative = 0.25
     """Largest standard deviation of the acceleration's norm at rest, m/s^2."""
     still_rate_deg: NonNegative = 0.3
@@ -211,6 +213,49 @@ class Alignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Roll and pitch after levelling, deg."""
 
 
+class HealthModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When the filter counts as healthy, degraded, dead reckoning or diverged, and when it starts again."""
+
+    gnss_stale_s: Positive = 3.0
+    """GNSS without a usable measurement for longer is stale, s."""
+    pose_stale_s: Positive = 1.5
+    """The same for pose fixes, s."""
+    wheel_stale_s: Positive = 1.0
+    """The same for the wheel, s."""
+    suspect_count: Annotated[int, msgspec.Meta(ge=1)] = 5
+    """A sensor is suspect when so many more of its measurements were not explained by the state than were, -."""
+    dead_reckoning_s: Positive = 3.0
+    """Without an applied position for longer the filter is dead reckoning, s."""
+    recovered_s: NonNegative = 10.0
+    """So long after its return from dead reckoning or divergence the filter is recovered, not yet healthy, s."""
+    max_sigma_m: Positive = 3.0
+    """A larger stated horizontal sigma is degraded, m."""
+    max_sigma_yaw_deg: Positive = 5.0
+    """The same for yaw, deg."""
+    lost_s: Positive = 10.0
+    """Over so long or longer no position was explained by the state: diverged, s."""
+    lost_count: Annotated[int, msgspec.Meta(ge=1)] = 10
+    """And over so many positions or more, -."""
+    max_speed: Positive = 150.0
+    """A land vehicle that is faster has diverged, m/s."""
+    max_tilt_deg: Positive = 60.0
+    """A land vehicle that is tilted further has diverged, deg."""
+    blown_sigma_m: Positive = 1000.0
+    """With a larger stated horizontal sigma the filter has diverged, m."""
+    blown_sigma_yaw_deg: Positive = 60.0
+    """The same for yaw, deg."""
+    restart: bool = True
+    """Align anew when the filter has diverged and a position comes that shows it."""
+    restart_pause_s: NonNegative = 10.0
+    """Not within so long after a start, times the number of starts: what is wrong may be the IMU, s."""
+    alone_s: Positive = 60.0
+    """One sensor alone weighs more than a state that no explained position has held for so long, s."""
+    wide_sigma_yaw_deg: Positive = 10.0
+    """Or at once where the yaw was known worse than this just before: updates are no longer linear, deg."""
+    far_m: Positive = 10.0
+    """Pose fixes alone, or two sensors that agree only roughly, must contradict the state by more than this, m."""
+
+
 class FusionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole filter."""
 
@@ -227,6 +272,7 @@ class FusionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     estimate: Estimate = Estimate()
     gates: Gates = Gates()
     alignment: Alignment = Alignment()
+    health: HealthModel = HealthModel()
 
 
 def check(config: msgspec.Struct, path: str = "fusion") -> None:

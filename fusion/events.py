@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fusion._linalg import Vector
 from fusion.covariance import Noise
+from fusion.divergence import HealthLimits
 from fusion.layout import Layout
 from fusion.state import Floats
 
@@ -62,12 +63,14 @@ class Parameters(NamedTuple):
     per_speed: float
     min_speed: float
     still_window_ns: int
+    still_wait_ns: int
     still_ratio: float
     still_accel_var: float
     still_rate_var: float
     still_max_speed: float
     zero_velocity_var: float
     zero_rate_var: float
+    health: HealthLimits
 
 
 class Measurements(NamedTuple):
@@ -106,9 +109,9 @@ class Events(NamedTuple):
 class Recorder(NamedTuple):
     """Output arrays, filled from ``filled`` = (states, decisions) on; an event met AGAIN needs a row of them to itself.
 
-    States: t (N,), nav (N, 16) and sigma_state (N, 15) without the wheel scale, pose_cov (N, 6, 6). Decisions: event
-    (M,) index of the event; sensor, reason, dof (M,) int8; innovation, sigma (M, 3); scores (M, 5): NIS, threshold,
-    metres moved, yaw moved, weight.
+    States: t (N,), nav (N, 16) and sigma_state (N, 15) without the wheel scale, pose_cov (N, 6, 6), health (N, 2) int8:
+    Health and Cause, levels (N, 5) int8. Decisions: event (M,) index of the event; sensor, reason, dof (M,) int8;
+    innovation, sigma (M, 3); scores (M, 5): NIS, threshold, metres moved, yaw moved, weight.
     """
 
     filled: NDArray[np.int64]
@@ -116,6 +119,8 @@ class Recorder(NamedTuple):
     nav: Floats
     pose_cov: Floats
     sigma_state: Floats
+    health: NDArray[np.int8]
+    levels: NDArray[np.int8]
     event: NDArray[np.int64]
     sensor: NDArray[np.int8]
     reason: NDArray[np.int8]
@@ -133,6 +138,8 @@ def new_recorder(states: int, decided: int) -> Recorder:
         nav=np.zeros((states, 16)),
         pose_cov=np.zeros((states, 6, 6)),
         sigma_state=np.zeros((states, 15)),
+        health=np.zeros((states, 2), np.int8),
+        levels=np.zeros((states, 5), np.int8),
         event=np.zeros(decided, np.int64),
         sensor=np.zeros(decided, np.int8),
         reason=np.zeros(decided, np.int8),

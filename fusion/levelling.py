@@ -36,6 +36,12 @@ class Window:
         return mean
 
     @property
+    def latest_rate(self) -> Floats:
+        """Mean rate (3,) over the last samples, rad/s."""
+        mean: Floats = self.gyro[-_FEWEST:].mean(axis=0)
+        return mean
+
+    @property
     def force(self) -> Floats:
         """Mean specific force (3,), m/s^2."""
         mean: Floats = self.accel.mean(axis=0)

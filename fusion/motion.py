@@ -7,7 +7,7 @@ from fusion.events import Parameters
 from fusion.gating import correct, innovate, whiten
 from fusion.measurements import body_velocity
 from fusion.result import Sensor
-from fusion.state import C_COUNT, C_TICK, E_WHEEL_SCALE, RING_SIZE, Core, Floats, Nanoseconds
+from fusion.state import C_COUNT, C_TICK, E_WHEEL_SCALE, H_START, RING_SIZE, Core, Floats, Nanoseconds
 from sensors._kernels import EARTH_RATE
 from sensors.kernel import kernel
 
@@ -89,7 +89,9 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     nav, P, R, residual = core.nav, core.P, core.R, core.residual
     speed = np.sqrt(nav[3] ** 2 + nav[4] ** 2 + nav[5] ** 2)
     quiet = False
-    if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4]):
+    # right after a start the speed is known so badly that a steady creep would pass for rest
+    settled = now - core.health[H_START] >= par.still_wait_ns
+    if par.zero_velocity and settled and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4]):
         full, force, turn = shaking(core.ring, core.ring_t, core.clock, nav, residual, par.still_window_ns, now)
         quiet = full and still(core.quietest, par, force, turn)
         if quiet:

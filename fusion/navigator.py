@@ -8,14 +8,15 @@ import numpy as np
 from fusion._kernels import process
 from fusion.alignment import SERVING, Aligner, Initial
 from fusion.config import FusionConfig
-from fusion.events import OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
+from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
+from fusion.health import begin
 from fusion.history import read_only
 from fusion.layout import prior_variances, used
 from fusion.mechanization import refresh
 from fusion.recording import decisions, join, states, unused
-from fusion.result import Decisions, Reason, States
+from fusion.result import Decisions, Reason, Restart, States
 from fusion.sources import APPLY, RECORDS, Sources, joined, parts, sources, split
-from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, ERROR_SIZE, NAV_SIZE, Core, Floats, new_core
+from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, ERROR_SIZE, H_CAUSE, NAV_SIZE, Core, Floats, new_core
 from fusion.timeline import merge, parameters
 from sensors import pieces
 from sensors.clock import NS_PER_S
@@ -38,18 +39,22 @@ class Navigator:
         self._config, self._par = config, parameters(vehicle, config)
         self._priors = prior_variances(vehicle, config)
         self.state_count = used(self._par.layout)
-        self._aligner = Aligner(vehicle, config, self._par)
+        self._aligner = self._new_aligner()
         self._kept_ns = round((config.alignment.window_s + kept_s) * NS_PER_S)
         self._rows = dict.fromkeys(RECORDS, 0)
         self._imu: list[Imu] = []
         """Samples after the state; before alignment those before it as well, as far as they are kept."""
         self._decisions: list[Decisions] = []
         self._states: list[States] = []
+        self._restarts: list[Restart] = []
         self.pending = self._nothing = sources(self._empty, config)
         self._first_imu_ns = FOREVER
         self.last_imu_ns = NEVER
         self.core: Core | None = None
+        self._diverged: Core | None = None
+        """The core that was given up last."""
         self.aligned_ns: int | None = None
+        """Time of the first state."""
 
     def add(self, piece: Log) -> None:
         """Take the measurements and IMU samples of a piece; nothing is decided yet.
@@ -90,17 +95,27 @@ class Navigator:
 
     def advance(self, known_ns: int) -> None:
         """Go on to known_ns at most, the time up to which every measurement has been added."""
-        if not self._imu:
-            return
-        imu: Imu = pieces.joined(self._imu)
-        core = self.core or self._align(imu, min(known_ns, self.last_imu_ns))
-        if core is None:
-            self._imu = [imu[int(np.searchsorted(imu.t_ns, known_ns - self._kept_ns)) :]]
-            return
-        first, last = np.searchsorted(imu.t_ns, (core.clock[C_STATE], known_ns), side="right")
-        self._imu = [imu[last:]] if last < len(imu) else []
-        if first < last:
-            self._process(core, imu[first:last])
+        while self._imu:
+            imu: Imu = pieces.joined(self._imu)
+            core = self.core or self._align(imu, min(known_ns, self.last_imu_ns))
+            if core is None:
+                self._imu = [imu[int(np.searchsorted(imu.t_ns, known_ns - self._kept_ns)) :]]
+                return
+            first, last = np.searchsorted(imu.t_ns, (core.clock[C_STATE], known_ns), side="right")
+            self._imu = [imu[last:]] if last < len(imu) else []
+            if first == last or self._process(core, imu[first:last]):
+                return
+            # no sample before the end of the old state is looked at: a piece may not hold it
+            self._give_up(core)
+            self._imu = [imu[int(np.searchsorted(imu.t_ns, core.clock[C_STATE], side="right")) :]]
+
+    def _give_up(self, core: Core) -> None:
+        """Align anew from the state's time on, by whole windows of the IMU."""
+        self._restarts.append(Restart(int(core.clock[C_STATE]), int(core.health[H_CAUSE])))
+        self._diverged, self.core, self._aligner = core, None, self._new_aligner()
+
+    def _new_aligner(self) -> Aligner:
+        return Aligner(self._empty.vehicle, self._config, self._par)
 
     def decide(self, reason: Reason, last_ns: int | None = None) -> None:
         """Measurements up to last_ns (None: all) are decided: they are not applied, for this reason."""
@@ -120,6 +135,11 @@ class Navigator:
         self._decisions.clear()
         return join(taken or [unused(self._nothing, Reason.LATE)])
 
+    def take_restarts(self) -> tuple[Restart, ...]:
+        """Divergences since the last call after which alignment began anew."""
+        taken, self._restarts = self._restarts, []
+        return tuple(taken)
+
     def _align(self, imu: Imu, known_ns: int) -> Core | None:
         """Offer pending measurements up to known_ns in stamp order until one completes a first state."""
         waiting, columns = self.pending, (imu.t_ns, imu.gyro, imu.accel)
@@ -134,11 +154,13 @@ class Navigator:
         if len(early.t_ns):
             self._decisions.append(unused(early, Reason.BEFORE_ALIGNMENT, initial))
         if initial is not None:
-            self.core, self.aligned_ns = start(initial, imu, self._priors), initial.t_ns
+            self.core = start(initial, imu, self._priors)
+            begin(self.core, initial.t_ns, self._diverged)
+            self.aligned_ns = initial.t_ns if self.aligned_ns is None else self.aligned_ns
         return self.core
 
-    def _process(self, core: Core, imu: Imu) -> None:
-        """Run samples with every measurement up to the last of them."""
+    def _process(self, core: Core, imu: Imu) -> bool:
+        """Run samples with every measurement up to the last of them; False: the filter has diverged on the way."""
         last, now = int(imu.t_ns[-1]), int(core.clock[C_STATE])
         if len(self.pending.t_ns) and self.pending.t_ns[0] <= now:
             self.decide(Reason.LATE, now)
@@ -149,11 +171,16 @@ class Navigator:
         events = timeline.events
         outputs = int((events.kind == OUTPUT).sum())
         recorder = new_recorder(outputs, len(events.t) - outputs)
-        feed(core, imu, events, found.measurements, self._par, recorder)
+        done = feed(core, imu, events, found.measurements, self._par, recorder)
         if outputs:
             self._states.append(states(recorder))
         if recorder.filled[1]:
             self._decisions.append(decisions(recorder, timeline))
+        if done == len(events.t):
+            return True
+        rest = found.chosen(slice(int((events.kind[:done] < MOTION).sum()), None))
+        self.pending = joined((rest, self.pending))
+        return False
 
 
 def start(initial: Initial, imu: Imu, priors: Floats | None = None) -> Core:
@@ -177,10 +204,11 @@ def start(initial: Initial, imu: Imu, priors: Floats | None = None) -> Core:
     return core
 
 
-def feed(core: Core, imu: Imu, events: Events, measurements: Measurements, par: Parameters, rec: Recorder) -> None:
-    """Run the kernel over an IMU record and all events up to its last sample.
+def feed(core: Core, imu: Imu, events: Events, measurements: Measurements, par: Parameters, rec: Recorder) -> int:
+    """Run the kernel over an IMU record and all events up to its last sample; the first event not reached.
 
     Every column goes in read-only and contiguous: one compiled kernel serves every log, whatever its sensors.
     """
     columns = Measurements(*(read_only(column) for column in measurements))
-    process(core, read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel), events, 0, columns, par, rec)
+    samples = read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel)
+    return int(process(core, *samples, events, 0, columns, par, rec))

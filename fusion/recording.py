@@ -30,6 +30,9 @@ def states(rec: Recorder) -> States:
         nav[:, ACCEL_BIAS],
         rec.pose_cov[:n],
         rec.sigma_state[:n],
+        rec.health[:n, 0],
+        rec.health[:n, 1],
+        rec.levels[:n],
     )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,13 +53,65 @@ class Reason(IntEnum):
     """Pose fix with two modes that agree in no observed direction."""
 
 
+class Health(IntEnum):
+    """State of health, worst first where several hold: diverged, dead reckoning, degraded, recovered, healthy."""
+
+    INITIALIZING = 0
+    """There is no state: before the first alignment, or between a divergence and the next."""
+    HEALTHY = 1
+    DEGRADED = 2
+    """A sensor that the drive has is not good, or the stated sigma is large; the cause says which."""
+    DEAD_RECKONING = 3
+    """No position was applied for a while."""
+    DIVERGED = 4
+    """Not to be used; the cause says why."""
+    RECOVERED = 5
+    """All is well again, but only for a short time."""
+
+
+class Cause(IntEnum):
+    """Why the state is degraded or diverged."""
+
+    NONE = 0
+    GNSS_POSITION = 1
+    GNSS_VELOCITY = 2
+    GNSS_YAW = 3
+    POSE_FIX = 4
+    WHEEL = 5
+    SIGMA = 6
+    """Position or yaw is known badly."""
+    NOT_FINITE = 7
+    """The state is not finite, or a variance not a number above zero."""
+    TOO_FAST = 8
+    """Faster than any land vehicle."""
+    COVARIANCE = 9
+    """Position or yaw is not known at all."""
+    REJECTED = 10
+    """No position was explained by the state for long."""
+    TILTED = 11
+    """A land vehicle on its side: the IMU's axes are others."""
+
+
+class Level(IntEnum):
+    """How far a sensor is to be trusted."""
+
+    ABSENT = 0
+    """The filter has judged none of its measurements."""
+    STALE = 1
+    """None that could be used for a while."""
+    SUSPECT = 2
+    """The state does not explain them."""
+    GOOD = 3
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
     """States at t_ns (N,), each after all measurements up to and including its time.
 
     llh (N, 3); vel_enu (N, 3) m/s; q_enu_body (N, 4) xyzw; gyro_bias (N, 3) rad/s; accel_bias (N, 3) m/s^2;
     pose_cov (N, 6, 6): position ENU m, attitude (left error, ENU) rad; sigma (N, 15): standard deviation of the whole
-    error state: position ENU m, velocity ENU m/s, attitude rad, gyro bias rad/s, accelerometer bias m/s^2.
+    error state: position ENU m, velocity ENU m/s, attitude rad, gyro bias rad/s, accelerometer bias m/s^2; health,
+    cause (N,) and levels (N, 5) of each sensor, int8: Health, Cause and Level.
     """
 
     t_ns: NDArray[np.int64]
@@ -69,6 +122,9 @@ class States:
     accel_bias: Floats
     pose_cov: Floats
     sigma: Floats
+    health: NDArray[np.int8]
+    cause: NDArray[np.int8]
+    levels: NDArray[np.int8]
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -101,11 +157,21 @@ class Decisions:
     weight: Floats
 
 
+class Restart(NamedTuple):
+    """The filter diverged (Cause) and was aligned anew from t_ns on; whether it succeeded shows in
+    the decisions."""
+
+    t_ns: int
+    cause: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FusionResult:
-    """States, decisions, the time of the first state (None: never aligned, states are empty) and what was left out."""
+    """States, decisions, the time of the first state (None: never aligned, states are empty), what was left out, and
+    when the filter was started again."""
 
     states: States
     decisions: Decisions
     aligned_ns: int | None
     left_out: Sequence[LeftOut] = ()
+    restarts: Sequence[Restart] = ()

@@ -11,6 +11,7 @@ from fusion.alignment import SERVING, Initial
 from fusion.arrival import arrive
 from fusion.config import FusionConfig
 from fusion.events import Measurements
+from fusion.health import begin
 from fusion.history import (
     M_EVENTS,
     M_NEXT,
@@ -194,7 +195,9 @@ class RewindingNavigator(Navigator):
     def _begin(self, initial: Initial, imu: Imu, silent_ns: int) -> None:
         """Begin with a first state; silent_ns: states up to this time were not known when the clock read it."""
         length_s = self._config.history_s
-        self.core, self.aligned_ns = with_snapshots(start(initial, imu, self._priors), length_s), initial.t_ns
+        core = start(initial, imu, self._priors)
+        begin(core, initial.t_ns, None)
+        self.core, self.aligned_ns = with_snapshots(core, length_s), initial.t_ns
         self._columns = columns_for(self._nothing.measurements, length_s)
         self._history = new_history(len(self.core.ring_t), self._columns, length_s)
         mark = self._history.mark

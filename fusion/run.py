@@ -54,13 +54,14 @@ class Session:
         if self._samples < 2:
             raise EgolocError("the log has no IMU samples: expected sensor_msgs/msg/Imu on a topic")
         self._navigator.advance(FOREVER)
-        aligned = self._navigator.aligned_ns is not None
+        aligned = self._navigator.core is not None
         self._navigator.decide(Reason.OUTSIDE_IMU if aligned else Reason.BEFORE_ALIGNMENT)
         return self._result(())
 
     def _result(self, left_out: tuple[LeftOut, ...]) -> FusionResult:
         navigator = self._navigator
-        return FusionResult(navigator.take_states(), navigator.take_decisions(), navigator.aligned_ns, left_out)
+        states, decisions, restarts = navigator.take_states(), navigator.take_decisions(), navigator.take_restarts()
+        return FusionResult(states, decisions, navigator.aligned_ns, left_out, restarts)
 
     def _gaps(self, piece: Log, before_ns: int | None) -> tuple[LeftOut, ...]:
         """Gaps in the IMU that end in this piece."""
@@ -90,6 +91,7 @@ def joined(results: list[FusionResult]) -> FusionResult:
         join([result.decisions for result in results]),
         results[-1].aligned_ns,
         summed(entry for result in results for entry in result.left_out),
+        tuple(restart for result in results for restart in result.restarts),
     )
 
 

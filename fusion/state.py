@@ -64,6 +64,17 @@ G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8
 # entries of Core.doubt_clock
 D_COUNT, D_TIME, D_AGREED, D_BELIEVED, D_SINCE, D_STREAK, D_LAST, D_TRACKING, D_HELD = range(9)
 
+# entries of Core.health: Health and Cause; when the core was aligned, a position was applied, one was explained, the
+# filter came back, the yaw was last known worse than linear; positions not explained since, the first and the last of
+# them; how often it was aligned anew
+H_STATE, H_CAUSE, H_START, H_FED, H_HELD, H_BACK, H_WIDE, H_COUNT, H_SINCE, H_LAST, H_RESTARTS = range(11)
+
+# columns of Core.trust: when a measurement was last judged, last explained; how many more were not than were
+T_SEEN, T_GOOD, T_DOUBT = range(3)
+
+NEVER = -(2**62)
+"""Before any stamp."""
+
 # entries of Core.clock
 C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)
 
@@ -82,6 +93,7 @@ class Core(NamedTuple):
     horizontal variance that the last GNSS position stated.
     doubt (2, 13), doubt_clock (2, 9) int64: the last rejected GNSS position and pose fix (``fusion.recovery``,
     ``fusion.streak``); fresh (5,): the pose fix that is being judged: innovation east, north m and its R's ee, en, nn.
+    health (11,), trust (5, 3) int64: clocks of ``fusion.health`` (H_*, T_*).
     phi (9, 16), M (9, n), Mt (16, 16), H, W (3, n), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (n,): scratch.
     rate (3,): the body rate before the last sample, as events at its time saw it, rad/s.
@@ -102,6 +114,8 @@ class Core(NamedTuple):
     doubt: Floats
     doubt_clock: Nanoseconds
     fresh: Floats
+    health: Nanoseconds
+    trust: Nanoseconds
     phi: Floats
     M: Floats
     Mt: Floats
@@ -137,6 +151,8 @@ def new_core(size: int = ERROR_SIZE) -> Core:
         doubt=np.zeros((2, 13)),
         doubt_clock=np.zeros((2, 9), np.int64),
         fresh=np.zeros(5),
+        health=np.array([0, 0, *(NEVER,) * 5, 0, NEVER, NEVER, 0], np.int64),
+        trust=np.tile(np.array([NEVER, NEVER, 0], np.int64), (5, 1)),
         phi=np.zeros((9, ROW)),
         M=np.zeros((9, size)),
         Mt=np.zeros((ERROR_SIZE, ROW)),

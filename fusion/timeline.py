@@ -12,6 +12,7 @@ from scipy.special import gammaincinv
 
 from fusion.config import KERNELS, FusionConfig, check
 from fusion.covariance import Noise
+from fusion.divergence import HealthLimits
 from fusion.events import MOTION, OUTPUT, Events, Parameters
 from fusion.layout import layout_of
 from fusion.sources import APPLY, Sources
@@ -86,12 +87,41 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         per_speed=motion.sigma_per_speed,
         min_speed=motion.min_speed,
         still_window_ns=round(motion.still_window_s * 1e9),
+        still_wait_ns=round(motion.still_wait_s * 1e9),
         still_ratio=motion.still_ratio,
         still_accel_var=motion.still_accel**2,
         still_rate_var=float(np.radians(motion.still_rate_deg) ** 2),
         still_max_speed=motion.still_max_speed,
         zero_velocity_var=motion.zero_velocity_sigma**2,
         zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2) + noise.gyro_psd * motion.rate_hz,
+        health=_health_limits(config, land_vehicle=vehicle.land_vehicle),
+    )
+
+
+def _health_limits(config: FusionConfig, *, land_vehicle: bool) -> HealthLimits:
+    model = config.health
+    first, second, third = (_chi_square(config.gates.probability, dof) for dof in (1, 2, 3))
+    gnss, pose, wheel = (round(s * 1e9) for s in (model.gnss_stale_s, model.pose_stale_s, model.wheel_stale_s))
+    return HealthLimits(
+        explained=(first, second, third),
+        stale_ns=(gnss, gnss, gnss, pose, wheel),
+        suspect=model.suspect_count,
+        dead_reckoning_ns=round(model.dead_reckoning_s * 1e9),
+        recovered_ns=round(model.recovered_s * 1e9),
+        sigma_var=model.max_sigma_m**2,
+        sigma_yaw_var=float(np.radians(model.max_sigma_yaw_deg) ** 2),
+        lost_ns=round(model.lost_s * 1e9),
+        lost=model.lost_count,
+        max_speed2=model.max_speed**2 if land_vehicle else np.inf,
+        least_upright=float(np.cos(np.radians(model.max_tilt_deg))) if land_vehicle else -np.inf,
+        blown_var=model.blown_sigma_m**2,
+        blown_yaw_var=float(np.radians(model.blown_sigma_yaw_deg) ** 2),
+        restart=model.restart,
+        pause_ns=round(model.restart_pause_s * 1e9),
+        alone_ns=round(model.alone_s * 1e9),
+        wide_yaw_var=float(np.radians(model.wide_sigma_yaw_deg) ** 2),
+        far_m=model.far_m,
+        course_speed2=config.alignment.min_course_speed**2,
     )
 
 

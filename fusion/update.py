@@ -9,13 +9,14 @@ from fusion.blocks import renew
 from fusion.covariance import propagate
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, whiten
+from fusion.health import SOURCES, hopeless, judge, level_of, noted, questionable
 from fusion.measurements import heading
 from fusion.motion import motion
 from fusion.observing import measure, triple
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
 from fusion.robust import reweigh
-from fusion.state import ROW, Core
+from fusion.state import H_CAUSE, H_STATE, ROW, Core
 from fusion.streak import tally, threshold_of
 from sensors.kernel import kernel
 
@@ -26,6 +27,19 @@ _ACCEPTED = int(Reason.ACCEPTED)
 _CHI_SQUARE = int(Reason.CHI_SQUARE)
 _RECEIVER = int(Reason.RECEIVER)
 _MODES_AGREE = int(Reason.MODES_AGREE)
+_SOURCES = len(SOURCES)
+
+
+@kernel(inline="always")
+def gives_up(core: Core, par: Parameters, ev: Events, e: int, now: int) -> bool:
+    """Whether event e is a position that had better begin a new alignment than be judged by this state."""
+    kind = ev.kind[e]
+    return bool(
+        kind in (_GNSS_POSITION, _POSE_FIX)
+        and ev.verdict[e] < 0
+        and questionable(core.health, core.P, par.health)
+        and hopeless(core, par.health, kind, now)
+    )
 
 
 @kernel(inline="always")
@@ -39,7 +53,7 @@ def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Even
         age(core, core.span[0])
     propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
     if kind == OUTPUT:
-        record_state(core, rec, ev.t[e])
+        record_state(core, rec, par, ev.t[e])
         return
     accepted = _ACCEPTED
     if kind == MOTION:
@@ -48,6 +62,7 @@ def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Even
             return
     elif kind == _GNSS_VELOCITY and in_doubt(core, 0, ev.t[e]):
         record_decision(rec, e, kind, 0, _RECEIVER)
+        noted(core.health, core.trust, par.health.suspect, kind, False, False, ev.t[e])
         return
     else:
         dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
@@ -55,11 +70,35 @@ def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Even
             record_decision(rec, e, kind, 0, accepted)
             return
     k = record_decision(rec, e, kind, dof, _CHI_SQUARE)
-    if kind not in (_GNSS_POSITION, _POSE_FIX):
-        _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
-        return
+    if kind in (_GNSS_POSITION, _POSE_FIX):
+        passed, dof = _apply_position(core, rec, par, m, ev, e, rate, k, (dof, accepted))
+    else:
+        passed = _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
+    if kind < _SOURCES:
+        explained = passed and rec.scores[k, 0] <= par.health.explained[dof - 1]
+        noted(core.health, core.trust, par.health.suspect, kind, passed, explained, ev.t[e])
+
+
+@kernel(inline="always")
+def _apply_position(
+    core: Core,
+    rec: Recorder,
+    par: Parameters,
+    m: Measurements,
+    ev: Events,
+    e: int,
+    rate: Vector,
+    k: int,
+    found: tuple[int, int],
+) -> tuple[bool, int]:
+    """Apply the position (GNSS, pose fix) of event e that is in the core; what its fate says of the state.
+
+    found: what ``measure`` gave. Returns whether it passed, and its degrees of freedom.
+    """
+    dof, accepted = found
+    kind, now = ev.kind[e], ev.t[e]
     which = int(kind == _POSE_FIX)
-    threshold = threshold_of(core, par, dof, ev.t[e]) if which else par.gate[dof - 1]
+    threshold = threshold_of(core, par, dof, now) if which else par.gate[dof - 1]
     passed = _apply(core, rec, par, k, dof, threshold, accepted)
     first = par.layout.pose_error if which else par.layout.gnss_error
     if not passed and first >= 0:  # what lasted may have changed all at once: then the state need not move for it
@@ -70,14 +109,15 @@ def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Even
             dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
             passed = _apply(core, rec, par, k, dof, threshold, accepted)
     if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
-        tally(core, which, passed, ev.t[e])
+        tally(core, which, passed, now)
     if dof == 3:
         if passed:
-            believed(core, which, ev.t[e])
-        elif kind == _POSE_FIX:
-            doubted(core, par, 1, triple(rec.innovation, k), heading(attitude(core.nav)), ev.t[e])
+            believed(core, which, now)
+        elif which:
+            doubted(core, par, 1, triple(rec.innovation, k), heading(attitude(core.nav)), now)
         else:
-            doubted(core, par, 0, triple(rec.innovation, k), (1.0, 0.0), ev.t[e])
+            doubted(core, par, 0, triple(rec.innovation, k), (1.0, 0.0), now)
+    return passed, dof
 
 
 @kernel(inline="always")
@@ -127,8 +167,8 @@ def record_decision(rec: Recorder, event: int, sensor: int, dof: int, reason: in
 
 
 @kernel(inline="always")
-def record_state(core: Core, rec: Recorder, t: int) -> None:
-    """Record nav, the pose covariance (position, attitude) and every sigma."""
+def record_state(core: Core, rec: Recorder, par: Parameters, t: int) -> None:
+    """Record nav, the pose covariance (position, attitude), every sigma, and how the filter is doing."""
     P = core.P
     k = rec.filled[0]
     rec.filled[0] = k + 1
@@ -142,6 +182,10 @@ def record_state(core: Core, rec: Recorder, t: int) -> None:
         for j in range(6):
             b = j if j < 3 else j + 3
             rec.pose_cov[k, i, j] = P[a, b]
+    judge(core, par.health, t)
+    rec.health[k, 0], rec.health[k, 1] = core.health[H_STATE], core.health[H_CAUSE]
+    for sensor in range(_SOURCES):
+        rec.levels[k, sensor] = level_of(core.trust, par.health.stale_ns[sensor], par.health.suspect, sensor, t)
 
 
 @kernel(inline="always")

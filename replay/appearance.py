@@ -20,6 +20,11 @@ GATE_COLOURS = {
     "status": 0xA06A2AFF,
     "receiver": 0x9A4F6EFF,
 }
+HEALTH = ("initializing", "healthy", "degraded", "dead reckoning", "diverged", "recovered")
+"""The words of fusion.health.Health, by its codes."""
+HEALTH_COLOURS = dict(
+    zip(HEALTH, (0x5B5F66FF, 0x3F8A48FF, 0xBFAE35FF, 0xC77F2CFF, 0xC0453CFF, 0x3B6FB5FF), strict=True)
+)
 WIDTHS = (4.0, 2.8, 1.8, 0.8)
 """Of the tracks, in the palettes' order, screen points."""
 HIDDEN_COLOURS = {"hidden on purpose": 0x5A4E8CFF}

@@ -147,8 +147,8 @@ def _plot(
 
 
 def _lanes() -> rrb.StateTimelineView:
-    lanes = ["/gnss_status/**", "/gnss_hidden/**", "/update/**"]
-    return rrb.StateTimelineView(origin="/", contents=lanes, name="GNSS status and gates", time_view=LINKED)
+    lanes = ["/health/**", "/gnss_status/**", "/gnss_hidden/**", "/update/**"]
+    return rrb.StateTimelineView(origin="/", contents=lanes, name="Health, GNSS status and gates", time_view=LINKED)
 
 
 class _OverWholeDrive(rrb.Blueprint):  # type: ignore[misc]

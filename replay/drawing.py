@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from replay.appearance import (
     GATE_COLOURS,
+    HEALTH,
+    HEALTH_COLOURS,
     HIDDEN_COLOURS,
     LIMIT,
     PLACED,
@@ -142,7 +144,8 @@ def draw_innovations(canvas: Canvas, run: RunColumns, style: Style) -> None:
 
 
 def draw_lanes(canvas: Canvas, run: RunColumns, style: Style) -> None:
-    """GNSS status, stretches of hidden GNSS, and what the gates decided."""
+    """The filter's health, GNSS status, stretches of hidden GNSS, and what the gates decided."""
+    canvas.lane(f"health{style.suffix}", run.states["t_ns"], run.states["health"], HEALTH, HEALTH_COLOURS)
     if "gnss_position" in run.sensors and style.sensors:
         fixes = run.sensors["gnss_position"]
         known = fixes["status"] >= 0

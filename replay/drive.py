@@ -91,6 +91,7 @@ class Drive:
             "reference": self._evaluation.reference_facts(self._source),
             "hide_gnss": None if hide is None else msgspec.to_builtins(hide),
             "stretches": self._evaluation.stretches,
+            "health": self._watch.health.counts(self._evaluation.epochs()),
             "warnings": self._watch.findings(start_ns),
             "left_out": [
                 {"source": entry.source, "reason": entry.reason, "count": entry.count}

@@ -105,6 +105,12 @@ class Evaluation:
         """Stamp of the first IMU sample."""
         return self._first_imu_ns
 
+    def epochs(self) -> int:
+        """Stamps of the output grid from the first IMU sample to the last so far."""
+        if self._first_imu_ns is None:
+            return 0
+        return int(self._imu_ns // self._period_ns + -self._first_imu_ns // self._period_ns + 1)
+
     @property
     def stretches(self) -> list[tuple[int, int]] | None:
         """Start and end of the stretches of hidden GNSS that are used; None: nothing was to be hidden."""
@@ -125,8 +131,8 @@ class Evaluation:
         self._states.append(result.states)
         if len(result.states):
             self._known_ns = int(result.states.t_ns[-1])
-        elif result.aligned_ns is None:
-            self._known_ns = self._imu_ns - LATE_NS
+        else:  # not aligned, or not again
+            self._known_ns = max(self._known_ns, self._imu_ns - LATE_NS)
 
     def _settled_ns(self) -> int:
         """Up to when it is known what to compare with."""

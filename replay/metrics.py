@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fusion.result import Sensor
 from replay.config import Limits
+from replay.health import health_metrics
 from replay.segments import AXES, BELOW, METHODS, THRESHOLDS, Segments, tags
 from replay.sketch import Sketch, percentiles
 from replay.sums import Counts, Sums
@@ -46,6 +47,7 @@ def metrics_of(sums: Sums, logs: Mapping[str, Any] | None = None) -> Metrics:
     metrics["methods"] = _methods(counts, segments, sums.sketch)
     metrics["slices"] = {kind: _slices(sums, kind) for kind in ("scene", "mode") if segments.tags(kind)}
     metrics["alignment_s"] = counts.alignment_s
+    metrics["health"] = health_metrics(counts.health)
     metrics["decisions"] = counts.decisions
     metrics["left_out"] = counts.left_out
     metrics["warnings"] = counts.warnings

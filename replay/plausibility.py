@@ -1,16 +1,17 @@
-"""What must not pass for success: a filter that never started, diverged or lost track, and IMUs in other units or axes.
+"""What must not pass for success: a filter that never started or diverged, and IMUs in other units or axes.
 
-Nothing here changes a result. Each finding is one sentence, with a kind that programs can tell apart.
+Nothing here changes a result; whether it diverged the filter has said itself (``fusion.health``). Each finding is one
+sentence, with a kind that programs can tell apart.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.result import Decisions, FusionResult, Reason, Sensor, States
+from fusion.result import Cause, Decisions, FusionResult, Reason, Sensor
 from replay.decisions import APPLIED, FIXES
+from replay.health import Tally
 from sensors.clock import NS_PER_S
 from sensors.records import Imu, Log
 
@@ -27,15 +28,18 @@ LEAST_UPRIGHT = 0.8
 FASTEST_TURN = 2.0
 """A road vehicle turns faster than this for less than one per cent of its time, rad/s."""
 FASTEST_SPEED = 150.0
-"""A road vehicle's largest speed, m/s."""
-LOST_NS = 10 * NS_PER_S
-LOST_COUNT = 10
-"""So many positions over so long, each rejected by the chi-square gate: the filter no longer knows where it is."""
-INERT_SHARE = 0.5
+"""Distance is not counted where a road vehicle is said to be faster, m/s."""
+INERT_SHARE, INERT_COUNT = 0.5, 10
 """A sensor with more of its measurements rejected than this says something about itself or the filter."""
 
-_IS_POSITION = np.isin(np.arange(len(Sensor)), FIXES)
-_IS_JUDGED = np.isin(np.arange(len(Reason)), (*APPLIED, Reason.CHI_SQUARE))
+DIVERGED = {
+    Cause.NOT_FINITE: ("not_finite", "its state is not finite"),
+    Cause.TOO_FAST: ("too_fast", "it is faster than any road vehicle"),
+    Cause.COVARIANCE: ("unknown", "its own covariance says that position or yaw are unknown"),
+    Cause.REJECTED: ("lost", "positions contradict it"),
+    Cause.TILTED: ("tilted", "it lies on its side (are the IMU's axes forward, left, up?)"),
+}
+"""Kind and words for each cause of divergence."""
 
 
 class Watch:
@@ -45,10 +49,7 @@ class Watch:
         self._land_vehicle = land_vehicle
         self._imu = ImuWatch(land_vehicle=land_vehicle)
         self._aligned = False
-        self._states = self._not_finite = 0
-        self._first_not_finite_ns = 0
-        self._speed = 0.0
-        self._run = self._longest = _Run()
+        self.health = Tally()
         self._counts = np.zeros((len(Sensor), len(Reason)), np.int64)
 
     def add(self, piece: Log, result: FusionResult) -> None:
@@ -56,7 +57,7 @@ class Watch:
         if piece.imu is not None:
             self._imu.add(piece.imu)
         self._aligned = result.aligned_ns is not None
-        self._add_states(result.states)
+        self.health.add(result)
         self._add_decisions(result.decisions)
 
     def findings(self, start_ns: int) -> Findings:
@@ -64,38 +65,15 @@ class Watch:
         found = (
             *self._imu.findings(),
             ("never_aligned", self._never_aligned()),
-            ("not_finite", self._diverged(start_ns)),
-            ("too_fast", self._too_fast()),
-            ("lost", self._lost(start_ns)),
+            *self._diverged(start_ns),
+            ("restarted", self._restarted(start_ns)),
             ("rejected", self._rejected()),
         )
         return [{"kind": kind, "text": text} for kind, text in found if text]
 
-    def _add_states(self, states: States) -> None:
-        if not len(states):
-            return
-        bad = ~(np.isfinite(states.llh).all(axis=1) & np.isfinite(states.pose_cov).all(axis=(1, 2)))
-        if bad.any() and not self._not_finite:
-            self._first_not_finite_ns = int(states.t_ns[np.argmax(bad)])
-        self._not_finite += int(bad.sum())
-        self._states += len(states)
-        velocity = states.vel_enu[np.isfinite(states.vel_enu).all(axis=1)]
-        self._speed = max(self._speed, float(np.linalg.norm(velocity, axis=1).max(initial=0.0)))
-
     def _add_decisions(self, decisions: Decisions) -> None:
         pairs = decisions.sensor.astype(np.int64) * len(Reason) + decisions.reason
         self._counts += np.bincount(pairs, minlength=self._counts.size).reshape(self._counts.shape)
-        rows = np.flatnonzero(_IS_POSITION[decisions.sensor] & _IS_JUDGED[decisions.reason])
-        rows = rows[np.argsort(decisions.t_ns[rows], kind="stable")]
-        t_ns, rejected = decisions.t_ns[rows], decisions.reason[rows] == Reason.CHI_SQUARE
-        edges = np.flatnonzero(np.diff(rejected.astype(np.int8), prepend=0, append=0))
-        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            goes_on = first == 0 and self._run.count > 0
-            start_ns = self._run.start_ns if goes_on else int(t_ns[first])
-            self._run = _Run((self._run.count if goes_on else 0) + end - first, start_ns, int(t_ns[end - 1]))
-            self._longest = max(self._longest, self._run, key=lambda run: run.count)
-        if len(rejected) and not rejected[-1]:
-            self._run = _Run()
 
     def _never_aligned(self) -> str:
         if self._aligned:
@@ -103,43 +81,31 @@ class Watch:
         heading = "a heading (of a pose fix, two antennas or GNSS in motion)"
         return f"The filter never aligned, there is no output: it needs IMU, a position and {heading}."
 
-    def _diverged(self, start_ns: int) -> str:
-        if not self._not_finite:
-            return ""
-        first = (self._first_not_finite_ns - start_ns) / NS_PER_S
-        share = f"{self._not_finite} of {self._states} states"
-        return f"The filter diverged: {share} are not finite, the first after {first:.1f} s."
+    def _diverged(self, start_ns: int) -> Iterator[tuple[str, str]]:
+        for cause, stretches in self.health.diverged.items():
+            kind, words = DIVERGED[cause]
+            start, end = ((t - start_ns) / NS_PER_S for t in (stretches.start_ns, stretches.end_ns))
+            again = stretches.count - 1
+            more = f", and {again} times more" if again > 1 else ", and once more" if again else ""
+            yield kind, f"The filter diverged from {start:.1f} to {end:.1f} s{more}: {words}."
 
-    def _too_fast(self) -> str:
-        if not self._land_vehicle or self._speed <= FASTEST_SPEED:
+    def _restarted(self, start_ns: int) -> str:
+        restarts = self.health.restarts
+        if not restarts:
             return ""
-        return f"The filter diverged: its speed reaches {self._speed:.4g} m/s."
-
-    def _lost(self, start_ns: int) -> str:
-        """The longest time over which every position was rejected."""
-        run = self._longest
-        if run.count < LOST_COUNT or run.end_ns - run.start_ns < LOST_NS:
-            return ""
-        start, end = ((t - start_ns) / NS_PER_S for t in (run.start_ns, run.end_ns))
-        return f"The filter lost track: from {start:.1f} to {end:.1f} s it rejected all {run.count} positions."
+        first, times = (restarts[0].t_ns - start_ns) / NS_PER_S, len(restarts)
+        words = DIVERGED[Cause(restarts[0].cause)][1]
+        often = f"{times} times, first" if times > 1 else "once,"
+        return f"The filter was started again {often} at {first:.1f} s: {words}."
 
     def _rejected(self) -> str:
         """Sensors of which the chi-square gate rejected most."""
         named = []
         for sensor in (*FIXES, Sensor.GNSS_VELOCITY, Sensor.GNSS_YAW, Sensor.WHEEL):
             rejected, applied = int(self._counts[sensor, Reason.CHI_SQUARE]), int(self._counts[sensor, APPLIED].sum())
-            if rejected >= LOST_COUNT and rejected > INERT_SHARE * (rejected + applied):
+            if rejected >= INERT_COUNT and rejected > INERT_SHARE * (rejected + applied):
                 named.append(f"{sensor.name.lower().replace('_', ' ')} ({rejected} of {rejected + applied})")
         return f"The filter rejected most of a sensor: {', '.join(named)}." if named else ""
-
-
-@dataclass(frozen=True, slots=True)
-class _Run:
-    """Positions rejected one after the other, and the times of the first and the last."""
-
-    count: int = 0
-    start_ns: int = 0
-    end_ns: int = 0
 
 
 class ImuWatch:

@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from fusion.result import Health
 from replay.run_files import EXPECTED, SeenManifest, SeenMetrics, checked, read_json, read_table
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
@@ -20,7 +22,7 @@ Columns = Mapping[str, NDArray[Any]]
 
 AXES = ("lon", "lat", "yaw")
 STATES = (
-    *("t_ns", "x", "y", "z", "yaw", "ve", "vn", "stretch", "ref_x", "ref_y", "ref_yaw", "ref_speed"),
+    *("t_ns", "health", "x", "y", "z", "yaw", "ve", "vn", "stretch", "ref_x", "ref_y", "ref_yaw", "ref_speed"),
     *(f"{kind}_bias_{axis}" for kind in ("gyro", "accel") for axis in "xyz"),
     *(f"{kind}_{axis}" for kind in ("err", "sigma") for axis in AXES),
 )
@@ -36,8 +38,8 @@ DECISIONS = (
 class RunColumns:
     """One run.
 
-    states: STATES, each (N,); sensors: name -> DECISIONS without "sensor", each (M,), "reason" as codes into
-    `reasons`; metrics, manifest, config: the files as they stand.
+    states: STATES, each (N,), "health" as codes of Health; sensors: name -> DECISIONS without "sensor", each (M,),
+    "reason" as codes into `reasons`; metrics, manifest, config: the files as they stand.
     """
 
     name: str
@@ -76,7 +78,7 @@ def load_columns(run: Path) -> RunColumns:
             by_sensor[name] = {key: column[rows] for key, column in columns.items()}
     return RunColumns(
         name=run.resolve().name,
-        states={name: _array(states[name]) for name in STATES},
+        states={name: _codes_of(states[name], Health) if name == "health" else _array(states[name]) for name in STATES},
         sensors=by_sensor,
         reasons=reasons,
         metrics=_read_checked(run / "metrics.json", SeenMetrics),
@@ -150,6 +152,12 @@ def _codes(column: pa.ChunkedArray) -> tuple[NDArray[np.int64], list[str]]:
         column = column.dictionary_encode()
     array = column.unify_dictionaries().combine_chunks()
     return array.indices.to_numpy(zero_copy_only=False).astype(np.int64), array.dictionary.to_pylist()
+
+
+def _codes_of(column: pa.ChunkedArray, known: type[IntEnum]) -> NDArray[np.int64]:
+    """(N,) members of an enumeration."""
+    codes, names = _codes(column)
+    return np.array([known[name.upper()] for name in names], np.int64)[codes]
 
 
 def _array(column: pa.ChunkedArray) -> NDArray[Any]:

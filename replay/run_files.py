@@ -1,13 +1,15 @@
 """Reading the files of a run folder: what is missing, damaged or of another kind is named."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeVar
 
 import msgspec
 
-from fusion.result import Reason, Sensor
+from fusion.result import Cause, Health, Level, Reason, Sensor
+from replay.health import LEVELS
 from replay.references import Excluded
 from sensors.bounds import PositiveInt
 from sensors.errors import EgolocError
@@ -17,7 +19,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-CODES = {"sensor": Sensor, "reason": Reason, "excluded": Excluded}
+CODES: Mapping[str, type[IntEnum]] = {
+    "sensor": Sensor,
+    "reason": Reason,
+    "excluded": Excluded,
+    "health": Health,
+    "health_cause": Cause,
+    **dict.fromkeys(LEVELS, Level),
+}
 """Columns that are numbers in memory and dictionary strings (lower-case names) in Parquet."""
 TEXTS = ("scene", "mode")
 """Columns that are codes into lists of tags in memory and dictionary strings in Parquet."""
@@ -42,6 +51,7 @@ class Facts(TypedDict):
     reference: ReferenceFacts
     hide_gnss: dict[str, float] | None
     stretches: list[tuple[int, int]] | None
+    health: dict[str, int]
     warnings: list[dict[str, str]]
     left_out: list[dict[str, str | int]]
 

@@ -147,6 +147,7 @@ class Scorer:
             warnings=facts["warnings"],
             warning_counts=dict(Counter(entry["kind"] for entry in facts["warnings"])),
             left_out=facts["left_out"],
+            health=facts["health"],
         )
 
     def _decision_counts(self) -> dict[str, dict[str, int]]:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.result import States
+from fusion.result import Health, States
 from replay._kernels import axis_sigmas, turn_states
+from replay.health import LEVELS
 from replay.hiding import Stretches, stretch_index
 from replay.references import Samples, errors, evaluated_only, lever, only
 from sensors.geodesy import MapFrame, map_from_llh, rotation_map_enu
@@ -20,6 +21,9 @@ from sensors.rotation import wrap
 Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 Columns = dict[str, NDArray[Any]]
+
+_FIRST = int(Health.INITIALIZING)
+"""First of the codes: no cause, and no sensor seen, in the other columns."""
 
 
 def state_columns(
@@ -31,7 +35,8 @@ def state_columns(
     first_ns: int,
     stretches: Stretches | None,
 ) -> Columns:
-    """The columns of states.parquet: one row per state and per epoch without one (missing (M,): NaN there), in order.
+    """The columns of states.parquet: one row per state and per epoch without one (missing (M,): NaN, initializing and
+    no sensor seen there), in order.
 
     samples: the reference at all these times, in order, of the body's point (m) and from first_ns on; stretches: the
     only times that are scored, None: all.
@@ -39,8 +44,8 @@ def state_columns(
     estimate, R_map_body, pose_cov = _map_columns(states, frame)
     if len(missing):
         order = np.argsort(np.concatenate((states.t_ns, missing)), kind="stable")
-        spread = {name: _append_nan(column, len(missing))[order] for name, column in estimate.items()}
-        R_map_body, pose_cov = (_append_nan(a, len(missing))[order] for a in (R_map_body, pose_cov))
+        spread = {name: _append(column, len(missing))[order] for name, column in estimate.items()}
+        R_map_body, pose_cov = (_append(a, len(missing))[order] for a in (R_map_body, pose_cov))
     else:
         spread = estimate
     compared = _compare(spread, R_map_body, pose_cov, samples, np.asarray(point, np.float64), first_ns, stretches)
@@ -66,6 +71,8 @@ def _map_columns(states: States, frame: MapFrame) -> tuple[Columns, Floats, Floa
     }
     for name, bias in (("gyro_bias", states.gyro_bias), ("accel_bias", states.accel_bias)):
         columns |= {f"{name}_{axis}": column for axis, column in zip("xyz", bias.T, strict=True)}
+    columns |= {"health": states.health, "health_cause": states.cause}
+    columns |= dict(zip(LEVELS, states.levels.T, strict=True))
     return columns, R, cov
 
 
@@ -109,6 +116,7 @@ def _compare(
     }
 
 
-def _append_nan(column: Floats, count: int) -> Floats:
-    """The rows, and count rows of NaN behind them."""
-    return np.concatenate((column, np.full((count, *column.shape[1:]), np.nan)))
+def _append(column: NDArray[Any], count: int) -> NDArray[Any]:
+    """The rows, and count rows of NaN, of codes the first, behind them."""
+    fill = np.nan if column.dtype.kind == "f" else _FIRST
+    return np.concatenate((column, np.full((count, *column.shape[1:]), fill, column.dtype)))

@@ -60,6 +60,8 @@ class Counts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     warning_counts: dict[str, int]
     left_out: list[dict[str, Any]]
     format: int = _FORMAT
+    health: dict[str, int] = {}
+    """Epochs by state of health (and "state/cause"), and restarts (``replay.health``)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,6 +141,7 @@ def _merged_counts(parts: Mapping[str, Counts]) -> Counts:
         warnings=_examples(parts),
         warning_counts=dict(sorted(warnings.items())),
         left_out=_left_out(parts),
+        health=_added([counts.health for counts in every]),
     )
 
 

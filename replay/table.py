@@ -8,6 +8,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from replay.health import health_note
 from replay.segments import AXES, THRESHOLDS
 
 Metrics = Mapping[str, Any]
@@ -90,6 +91,8 @@ def notes(metrics: Metrics) -> Iterator[str]:
     if metrics["alignment_s"] is not None:  # else a warning says so
         within = ", the slowest log" if "logs" in metrics else ""
         yield f"Aligned {metrics['alignment_s']:.1f} s after the first IMU sample{within}."
+    if metrics["health"]:
+        yield health_note(metrics["health"])
     for reason, count in metrics["excluded"].items() if metrics["reference"]["kind"] else ():
         yield f"Excluded: {count} epochs: {EXCLUDED_TEXT[reason]}."
     for entry in metrics["left_out"]:

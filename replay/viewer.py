@@ -114,7 +114,8 @@ def _place(runs: Sequence[RunColumns]) -> MapPlace:
 def _scene(runs: Sequence[RunColumns], roots: Sequence[str], span_ns: tuple[int, int], place: MapPlace) -> Scene:
     sensors = dict.fromkeys(sensor for run in runs for sensor in run.sensors)
     lanes = sum(
-        len(run.sensors) + ("gnss_position" in run.sensors) + bool((run.states["stretch"] >= 0).any()) for run in runs
+        1 + len(run.sensors) + ("gnss_position" in run.sensors) + bool((run.states["stretch"] >= 0).any())
+        for run in runs
     )
     return Scene(
         roots=roots,

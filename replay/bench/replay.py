@@ -93,6 +93,7 @@ def _score(states: Columns, decisions: Columns) -> object:
         "reference": {"kind": "odometry", "source": "log", "heading": "attitude"},
         "hide_gnss": None,
         "stretches": None,
+        "health": {},
         "warnings": [],
         "left_out": [],
     }

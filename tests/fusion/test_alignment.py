@@ -241,3 +241,31 @@ def test_a_course_from_positions_waits_for_the_end_of_a_turn(drives: list[Drive]
         assert abs(imu.gyro[np.searchsorted(imu.t_ns, result.aligned_ns), 2]) < 0.3
         assert abs(first_errors(result, drive)[8]) < 4.0
     assert started > 5
+
+
+def test_a_course_in_a_turn_is_less_the_slip_of_an_antenna_ahead_of_the_axle() -> None:
+    """Starts in the middle of turns, the antenna 2.5 m ahead of the rear axle: up to 14 deg of slip."""
+    scene = scenarios.load("clean")
+    vehicle = msgspec.structs.replace(scene.vehicle, gnss_lever_arm=(2.5, 0.0, 1.2))
+    ratios, slips = [], []
+    for seed in range(500, 512):
+        drive = simulate_drive(60.0, seed, msgspec.structs.replace(scene, vehicle=vehicle))
+        imu = drive.log.imu
+        assert imu is not None
+        speed = np.linalg.norm(drive.truth.at(imu.t_ns).vel_enu, axis=1)
+        turning = np.flatnonzero((np.abs(imu.gyro[:, 2]) > 0.25) & (speed > 3.5) & (imu.t_ns - imu.t_ns[0] > 2e9))
+        for row in turning[:: max(1, len(turning) // 4)]:
+            log = without_yaw(
+                only(later(drive.log, (imu.t_ns[row] - imu.t_ns[0]) * 1e-9 - 0.2), "gnss", "gnss_velocity")
+            )
+            result = run(log, PROMPT)
+            if result.aligned_ns is None or result.aligned_ns > imu.t_ns[row] + 1e9:
+                continue
+            at = int(np.searchsorted(imu.t_ns, result.aligned_ns))
+            slips.append(abs(imu.gyro[at, 2] * 2.5 / speed[at]))
+            ratios.append(first_errors(result, drive)[8])
+    print(f"{len(ratios)} starts, slip {np.degrees(np.median(slips)):.1f} deg, yaw {np.std(ratios):.2f} sigmas rms")
+    assert len(ratios) > 10
+    assert np.degrees(np.median(slips)) > 4.0
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.5
+    assert np.abs(ratios).max() < 4.0

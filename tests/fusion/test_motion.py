@@ -1,5 +1,6 @@
 """Zero velocity at rest, and what the wheels forbid."""
 
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -10,12 +11,13 @@ from numpy.typing import NDArray
 from fusion.config import FusionConfig
 from fusion.result import Decisions, FusionResult, Reason, Sensor
 from fusion.run import run
-from sensors.geodesy import enu_from_llh
-from sensors.records import Log
+from sensors.geodesy import MapFrame, enu_from_llh, map_from_llh
+from sensors.records import Log, PoseFix
 from sensors.simulate import scenarios
 from sensors.simulate.drive import Drive, sense, simulate_drive
 from sensors.simulate.trajectory import KNOT_S, Profile, Truth
-from tests.fusion.free import HONEST, Floats
+from sensors.vehicle import Vehicle
+from tests.fusion.free import HONEST, Floats, at_rest
 from tests.fusion.scenes import only, with_outage
 
 AIDED = ("gnss", "gnss_velocity", "pose_fixes")
@@ -52,8 +54,9 @@ def test_rest_is_found_where_the_vehicle_stands_and_only_there(drive: Drive, res
     t = result.states.t_ns
     resting = speed(drive, t) == 0.0
     found = np.isin(t, at(result.decisions, Sensor.ZERO_VELOCITY))
-    # the window of a second must have passed at rest
+    # the window of a second must have passed at rest, and the wait after the start
     settled = np.convolve(resting, np.ones(12), "full")[: len(t)] == 12
+    settled &= t - t[0] > HONEST.motion.still_wait_s * 1e9
     print(f"{resting.mean():.2f} of the time at rest; found in {found[settled].mean():.3f} of it once settled")
     assert settled.sum() > 100
     assert found[settled].mean() > 0.95
@@ -164,3 +167,27 @@ def test_rest_makes_the_gyro_bias_known() -> None:
         f"gyro bias sigma after {standing:.1f} s at rest, deg/h: {sigma[0].round(1)} without, {sigma[1].round(1)} with"
     )
     assert (sigma[1] < sigma[0]).all()
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 0.4, 0.6, 1.0, 1.5])
+def test_a_steady_creep_from_the_start_is_not_rest(speed_m_s: float) -> None:
+    """Pose fixes alone, 5 cm, and an IMU as quiet as at rest: only the fixes show that it moves, after seconds."""
+    frame = MapFrame("enu", (49.0, 8.4, 110.0))
+    t = 10**18 + np.arange(3001) * 10_000_000
+    nav = np.zeros(17)
+    nav[:3], nav[3], nav[9] = (np.radians(49.0), np.radians(8.4), 110.0), speed_m_s, 1.0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        imu = at_rest(nav, t)
+        imu = replace(
+            imu, accel=imu.accel + rng.normal(0.0, 0.02, (3001, 3)), gyro=imu.gyro + rng.normal(0.0, 2e-4, (3001, 3))
+        )
+        at_ns, sigma = t[10::10], np.array([0.05, 0.05, np.radians(0.1)])
+        way = np.outer(speed_m_s * (at_ns - t[0]) * 1e-9, [1.0, 0.0, 0.0])
+        pose, cov = way + sigma * rng.normal(size=way.shape), np.tile(np.diag(sigma**2), (len(at_ns), 1, 1))
+        fixes = PoseFix(at_ns, at_ns, pose, cov)
+        result = run(Log(imu=imu, pose_fixes=fixes, vehicle=Vehicle(), map_frame=frame))
+        error = map_from_llh(frame, result.states.llh)[:, 0] - speed_m_s * (result.states.t_ns - t[0]) * 1e-9
+        rests = (result.decisions.sensor == Sensor.ZERO_VELOCITY).sum()
+        assert np.abs(error).max() < 0.3
+        assert (rests > 200) == (speed_m_s == 0.0)

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusion.config import FusionConfig, Gates
+from fusion.config import FusionConfig, Gates, HealthModel
 from fusion.filter import Localizer
 from fusion.result import Reason, Sensor
 from fusion.run import run
@@ -19,7 +19,7 @@ from tests.fusion.free import Floats
 from tests.fusion.rough import LIMITS, fused_errors, off, rough_drive
 from tests.fusion.scenes import seconds, with_outage, without
 
-STUBBORN = FusionConfig(gates=Gates(outvoted=10**9))
+STUBBORN = FusionConfig(gates=Gates(outvoted=10**9), health=HealthModel(restart=False))
 """Nothing outvotes its state."""
 
 

@@ -59,6 +59,7 @@ def assemble(log: Log, config: RunConfig, result: FusionResult) -> Assembled:
         "reference": evaluation.reference_facts("log"),
         "hide_gnss": None if hide is None else {"every_s": hide.every_s, "length_s": hide.length_s},
         "stretches": evaluation.stretches,
+        "health": {},
         "warnings": [],
         "left_out": [],
     }
@@ -69,7 +70,19 @@ def nothing(aligned_ns: int | None) -> FusionResult:
     """A result without rows."""
     none, three, six = np.empty(0), np.empty((0, 3)), np.empty((0, 6, 6))
     t_ns, codes = np.empty(0, np.int64), np.empty(0, np.int8)
-    states = States(t_ns, three, three, np.empty((0, 4)), three, three, six, np.empty((0, 15)))
+    states = States(
+        t_ns,
+        three,
+        three,
+        np.empty((0, 4)),
+        three,
+        three,
+        six,
+        np.empty((0, 15)),
+        codes,
+        codes,
+        np.empty((0, 5), np.int8),
+    )
     decided = Decisions(t_ns, t_ns, codes, t_ns, codes, three, three, none, none, codes, none, none, none)
     return FusionResult(states, decided, aligned_ns)
 

@@ -18,6 +18,7 @@ from tests.replay.spoiling import Replayed
 
 T0_NS = 1_700_000_000_000_000_000
 SENSORS = ("gnss_position", "pose_fix", "non_holonomic")
+HEALTH = ("healthy", "dead_reckoning", "recovered")
 REASONS = ("accepted", "chi_square", "status")
 CONFIG = "seed = 0\n\n[fusion.gnss]\nuse = true\ninflation = {inflation}\n\n[limits]\nlon_m = 0.6\n"
 METRICS = {
@@ -55,7 +56,7 @@ def _wander(rng: np.random.Generator, n: int, sigma: float) -> NDArray[np.float6
 
 
 def _states(rng: np.random.Generator, duration_s: float, hz: float) -> dict[str, Any]:
-    """A figure of eight at 10 m/s; the reference is missing between 20 and 25 s."""
+    """A figure of eight at 10 m/s; the reference is missing between 20 and 25 s; dead reckoning from 30 to 45 s."""
     n = int(duration_s * hz)
     t = np.arange(n) / hz
     phase = t * 0.05
@@ -88,6 +89,8 @@ def _states(rng: np.random.Generator, duration_s: float, hz: float) -> dict[str,
         columns[f"err_{axis}"] = np.where(known, errors[axis], np.nan)
         columns[f"sigma_{axis}"] = np.full(n, sigma)
     columns["stretch"] = np.full(n, -1, np.int32)
+    health = np.where(t < 30, 0, np.where(t < 45, 1, 2)).astype(np.int8)
+    columns["health"] = pa.DictionaryArray.from_arrays(pa.array(health), pa.array(HEALTH))
     return columns
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.result import Decisions, FusionResult, Reason, Sensor, States
+from fusion.result import Decisions, FusionResult, Health, Level, Reason, Sensor, States
 from sensors.clock import NS_PER_S
 from sensors.geodesy import MapFrame, llh_from_map, rotation_map_enu
 from sensors.records import GnssFix, GnssStatus, GnssVelocity, Imu, Log, PoseFix, Trajectory
@@ -90,6 +90,9 @@ def states(t_ns: Nanoseconds, error: tuple[float, float, float] = (0.0, 0.0, 0.0
         np.zeros((n, 3)),
         cov,
         np.full((n, 15), 0.1),
+        np.full(n, Health.HEALTHY, np.int8),
+        np.zeros(n, np.int8),
+        np.full((n, 5), Level.GOOD, np.int8),
     )
 
 

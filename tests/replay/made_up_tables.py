@@ -57,6 +57,7 @@ def facts(period_ns: int = PERIOD_NS, hidden_s: float | None = None, seconds: fl
         "reference": {"kind": "odometry", "source": "log", "heading": "attitude"},
         "hide_gnss": None if hidden_s is None else {"every_s": 20.0, "length_s": hidden_s},
         "stretches": None if hidden_s is None else planned,
+        "health": {"initializing": 3, "healthy": 5, "degraded/pose_fix": 2, "restarts": 1},
         "warnings": [{"kind": "lost", "text": "The filter lost track."}],
         "left_out": [{"source": "/imu", "reason": "stamp repeats", "count": 3}],
     }

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusion.result import FusionResult
+from fusion.result import Cause, FusionResult, Health
 from fusion.run import Session
 from replay.cli import main
 from sensors.mcap.io import write_log
@@ -112,7 +112,7 @@ class TestNoSuccess:
         done = replayed(at("a.mcap"))
         assert done.error == ""
         assert done.warnings()[0] == kind
-        assert "rejected" in done.warnings()
+        assert {"rejected", "tilted"} & set(done.warnings())
         assert text in done.text
         assert main(["info", str(at("a.mcap"))]) == 0
         assert text in " ".join(capsys.readouterr().out.split())
@@ -122,7 +122,8 @@ class TestNoSuccess:
         bare = Log(short_log.imu, short_log.gnss, short_log.gnss_velocity, vehicle=short_log.vehicle)
         done = replayed(write(at("a.mcap"), bare, {"/gnss/fix": value("latitude", 57.0, 250)}), "--hide-gnss", "15:2")
         assert done.warnings() == ["lost", "rejected"]
-        assert re.search(r"The filter lost track: from 25\.0 to 59\.9 s it rejected all 3\d\d positions\.", done.text)
+        assert "The filter diverged from 35.0 to 60.0 s: positions contradict it." in done.text
+        assert done.metrics["health"]["diverged_by"]["rejected"] == pytest.approx(25.1 / 60.0, abs=0.002)
         assert "…" not in done.text, "a column is cut off"
 
     def test_a_filter_that_is_not_finite(
@@ -132,13 +133,16 @@ class TestNoSuccess:
             result = push(session, piece)
             llh, vel = result.states.llh.copy(), result.states.vel_enu.copy()
             llh[200:], vel[190:200] = np.nan, 1e200
-            return replace(result, states=replace(result.states, llh=llh, vel_enu=vel))
+            health, cause = result.states.health.copy(), result.states.cause.copy()
+            health[190:], cause[190:200], cause[200:] = Health.DIVERGED, Cause.TOO_FAST, Cause.NOT_FINITE
+            states = replace(result.states, llh=llh, vel_enu=vel, health=health, cause=cause)
+            return replace(result, states=states)
 
         push = Session.push
         monkeypatch.setattr(Session, "push", diverged)
         write_log(at("a.mcap"), short_log)
         done = replayed(at("a.mcap"))
-        assert done.warnings() == ["not_finite", "too_fast"]
-        assert re.search(r"[34]\d\d of 5\d\d states are not finite, the first after 20\.\d s\.", done.text)
+        assert done.warnings() == ["too_fast", "not_finite"]
+        assert re.search(r"The filter diverged from 20\.\d to 60\.0 s: its state is not finite\.", done.text)
         assert 0.3 < done.metrics["methods"]["fusion"]["coverage"] < 0.4
         assert done.metrics["methods"]["fusion"]["ar"] < 0.4

@@ -6,8 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fusion.result import FusionResult, Reason, Sensor
-from replay.plausibility import SAMPLES, ImuWatch, Watch, imu_findings
+from fusion.result import Cause, FusionResult, Health, Reason, Restart, Sensor
+from replay.health import Tally, health_metrics, health_note
+from replay.plausibility import DIVERGED, SAMPLES, ImuWatch, Watch, imu_findings
 from sensors.records import Imu, Log
 from tests.replay.assembling import nothing
 from tests.replay.drives import START_NS, drive, stamps, still_imu
@@ -38,7 +39,8 @@ def _result(result: FusionResult, begin: int, end: int) -> FusionResult:
     for record in (result.states, result.decisions):
         rows = (record.t_ns >= begin) & (record.t_ns < end)
         parts.append(type(record)(**{name: getattr(record, name)[rows] for name in record.__dataclass_fields__}))
-    return FusionResult(parts[0], parts[1], result.aligned_ns)
+    restarts = tuple(restart for restart in result.restarts if begin <= restart.t_ns < end)
+    return FusionResult(parts[0], parts[1], result.aligned_ns, (), restarts)
 
 
 def rejecting(result: FusionResult, *stretches: tuple[float, float], sensor: Sensor | None = None) -> FusionResult:
@@ -58,17 +60,76 @@ def test_a_good_drive_has_no_findings(cuts: tuple[float, ...]) -> None:
     assert findings(*drive(60.0), cuts) == {}
 
 
-@pytest.mark.parametrize("cuts", CUTS)
-def test_a_filter_that_lost_track_is_told_from_when_to_when(cuts: tuple[float, ...]) -> None:
-    log, result = drive(60.0)
-    found = findings(log, rejecting(result, (5.0, 12.0), (15.0, 32.0), (40.0, 51.0)), cuts)
-    assert found["lost"] == "The filter lost track: from 15.0 to 31.9 s it rejected all 340 positions."
+def diverging(result: FusionResult, cause: Cause, *stretches: tuple[float, float]) -> FusionResult:
+    """The result of a filter that says it had diverged over some stretches (s)."""
+    health, causes = result.states.health.copy(), result.states.cause.copy()
+    for begin, end in stretches:
+        inside = slice(*np.searchsorted(result.states.t_ns, [START_NS + round(s * S) for s in (begin, end)]))
+        health[inside], causes[inside] = Health.DIVERGED, cause
+    return replace(result, states=replace(result.states, health=health, cause=causes))
 
 
 @pytest.mark.parametrize("cuts", CUTS)
-def test_nine_seconds_are_not_lost(cuts: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("cause", DIVERGED)
+def test_a_filter_that_diverged_is_told_from_when_to_when(cause: Cause, cuts: tuple[float, ...]) -> None:
     log, result = drive(60.0)
-    assert "lost" not in findings(log, rejecting(result, (15.0, 24.9), (25.0, 34.9)), cuts)
+    kind, words = DIVERGED[cause]
+    once = diverging(result, cause, (15.0, 32.0))
+    assert findings(log, once, cuts) == {kind: f"The filter diverged from 15.0 to 31.9 s: {words}."}
+    thrice = diverging(result, cause, (5.0, 12.0), (15.0, 32.0), (40.0, 60.0))
+    assert findings(log, thrice, cuts)[kind] == f"The filter diverged from 5.0 to 11.9 s, and 2 times more: {words}."
+
+
+@pytest.mark.parametrize("cuts", CUTS)
+def test_each_cause_is_told_apart(cuts: tuple[float, ...]) -> None:
+    """One follows another without a pause, at a cut as well."""
+    log, result = drive(60.0)
+    result = diverging(diverging(result, Cause.REJECTED, (10.0, 50.0)), Cause.TOO_FAST, (30.0, 40.0))
+    found = findings(log, result, cuts)
+    assert found["too_fast"].startswith("The filter diverged from 30.0 to 39.9 s: ")
+    assert found["lost"].startswith("The filter diverged from 10.0 to 29.9 s, and once more: ")
+
+
+def test_every_cause_of_divergence_has_words() -> None:
+    assert set(DIVERGED) == {cause for cause in Cause if cause >= Cause.NOT_FINITE}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [((21.5,), "once, at 21.5 s"), ((21.5, 48.0), "2 times, first at 21.5 s")]
+)
+def test_new_starts_are_told(seconds: tuple[float, ...], words: str) -> None:
+    log, result = drive(60.0)
+    restarts = tuple(Restart(START_NS + round(s * S), Cause.REJECTED) for s in seconds)
+    found = findings(log, replace(result, restarts=restarts))
+    assert found == {"restarted": f"The filter was started again {words}: positions contradict it."}
+
+
+def test_shares_of_time() -> None:
+    """600 epochs of which the first 100 have no state; of the others 20 are lost, 30 degraded by the wheel."""
+    _, result = drive(60.0, aligned_s=10.0)
+    result = diverging(result, Cause.REJECTED, (20.0, 22.0))
+    health, cause = result.states.health, result.states.cause
+    health[300:330], cause[300:330] = Health.DEGRADED, Cause.WHEEL
+    tally = Tally()
+    tally.add(replace(result, restarts=(Restart(0, Cause.REJECTED),)))
+    counts = tally.counts(600)
+    assert counts == {
+        "initializing": 100,
+        "healthy": 450,
+        "degraded/wheel": 30,
+        "diverged/rejected": 20,
+        "restarts": 1,
+    }
+    shares = health_metrics(counts)
+    assert shares["initializing"] == 100 / 600
+    assert shares["degraded"] == shares["degraded_by"]["wheel"] == 0.05
+    assert shares["diverged_by"] == {"rejected": 20 / 600}
+    assert shares["recovered"] == shares["dead_reckoning"] == 0.0
+    assert sum(shares[state.name.lower()] for state in Health) == pytest.approx(1.0)
+    assert health_note(shares) == (
+        "Health, % of time: initializing 16.7, healthy 75.0, degraded 5.0 (wheel 5.0), diverged 3.3 (rejected 3.3); "
+        "started again once."
+    )
 
 
 @pytest.mark.parametrize("cuts", CUTS)
@@ -76,25 +137,6 @@ def test_a_sensor_that_is_mostly_rejected_is_named(cuts: tuple[float, ...]) -> N
     log, result = drive(60.0)
     found = findings(log, rejecting(result, (10.0, 45.0), sensor=Sensor.POSE_FIX), cuts)
     assert found == {"rejected": "The filter rejected most of a sensor: pose fix (350 of 600)."}
-
-
-@pytest.mark.parametrize("cuts", CUTS)
-def test_states_that_are_not_finite_are_counted(cuts: tuple[float, ...]) -> None:
-    log, result = drive(60.0)
-    llh, cov = result.states.llh.copy(), result.states.pose_cov.copy()
-    llh[200:210, 2], cov[209:230, 5, 5] = np.nan, np.inf
-    found = findings(log, replace(result, states=replace(result.states, llh=llh, pose_cov=cov)), cuts)
-    assert found["not_finite"] == "The filter diverged: 30 of 600 states are not finite, the first after 20.0 s."
-
-
-@pytest.mark.parametrize("cuts", CUTS)
-def test_a_road_vehicle_is_not_that_fast(cuts: tuple[float, ...]) -> None:
-    log, result = drive(60.0)
-    velocity = result.states.vel_enu.copy()
-    velocity[300] = (300.0, 400.0, 0.0)
-    fast = replace(result, states=replace(result.states, vel_enu=velocity))
-    assert findings(log, fast, cuts)["too_fast"] == "The filter diverged: its speed reaches 500 m/s."
-    assert findings(log, fast, cuts, land_vehicle=False) == {}
 
 
 def test_a_filter_that_never_aligned_has_no_output() -> None:

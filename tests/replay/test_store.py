@@ -28,7 +28,9 @@ from tests.replay.drives import START_NS, drive
 S = 1_000_000_000
 STATES = (
     "t_ns x y z roll pitch yaw ve vn vu lat_deg lon_deg height_m gyro_bias_x gyro_bias_y gyro_bias_z accel_bias_x "
-    "accel_bias_y accel_bias_z pose_cov ref_x ref_y ref_z ref_yaw ref_speed ref_sigma_m ref_sigma_yaw excluded err_lon "
+    "accel_bias_y accel_bias_z health health_cause "
+    "gnss_position_level gnss_velocity_level gnss_yaw_level pose_fix_level "
+    "wheel_level pose_cov ref_x ref_y ref_z ref_yaw ref_speed ref_sigma_m ref_sigma_yaw excluded err_lon "
     "err_lat err_yaw sigma_lon sigma_lat sigma_yaw stretch scene mode log"
 )
 DECISIONS = (
@@ -150,6 +152,10 @@ class TestTables:
         assert {"gnss_position", "pose_fix", "wheel"} < set(decisions["sensor"].to_pylist())
         assert set(states["scene"].to_pylist()) == {"city", "canyon,night"}
         assert set(states["mode"].to_pylist()) == {""}
+        assert set(states["health"].to_pylist()) == {"initializing", "healthy"}
+        assert set(states["health_cause"].to_pylist()) == {"none"}
+        assert set(states["gnss_yaw_level"].to_pylist()) == {"absent"}
+        assert {"absent", "good"} == set(states["pose_fix_level"].to_pylist())
         assert set(decisions["log"].to_pylist()) == {"drive"}
 
     def test_tables_of_several_logs_are_one_dataset(self, log: Log, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ MakeRun = Callable[..., Path]
 FILES = ("states.parquet", "decisions.parquet", "metrics.json", "manifest.json", "config.toml")
 ONE_RUN = {
     "/summary",
+    "/health",
     "/gnss_status",
     "/update/gnss_position",
     "/update/pose_fix",
@@ -123,6 +124,9 @@ def test_no_line_crosses_a_pause(make_run: MakeRun) -> None:
 
 def test_lanes_change_where_the_run_changes(make_run: MakeRun) -> None:
     rrd = write_recording(make_run())
+    assert column(rrd, "/health", "StateChange:state") == ["healthy", "dead reckoning", "recovered", "-"]
+    t = np.array(stamps(rrd, "/health"))
+    assert np.allclose((t - t[0]) * 1e-9, [0.0, 30.0, 45.0, 60.0])
     assert column(rrd, "/gnss_status", "StateChange:state") == ["RTK float", "RTK fixed", "-", "RTK fixed", "-"]
     assert column(rrd, "/update/gnss_position", "StateChange:state") == ["status", "accepted", "-", "accepted", "-"]
     states = column(rrd, "/update/pose_fix", "StateChange:state")

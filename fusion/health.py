@@ -1,0 +1,154 @@
+"""How the filter is doing: one state of health, why, and how far each sensor is to be trusted.
+
+Everything is judged from what the filter knows: the ages of the last measurements that its state explains, streaks of
+those that it does not, its own sigmas, and what no vehicle can do. The clocks live in the core (``Core.health``,
+``Core.trust``) and change with every measurement, so that pieces, streaming and rewinding give the same bits.
+"""
+
+from fusion.divergence import HealthLimits, divergence, outweighed
+from fusion.result import Cause, Health, Level, Sensor
+from fusion.state import (
+    H_BACK,
+    H_CAUSE,
+    H_COUNT,
+    H_FED,
+    H_HELD,
+    H_LAST,
+    H_RESTARTS,
+    H_SINCE,
+    H_START,
+    H_STATE,
+    H_WIDE,
+    T_DOUBT,
+    T_GOOD,
+    T_SEEN,
+    Core,
+    Floats,
+    Nanoseconds,
+)
+from sensors.kernel import kernel
+
+SOURCES = (Sensor.GNSS_POSITION, Sensor.GNSS_VELOCITY, Sensor.GNSS_YAW, Sensor.POSE_FIX, Sensor.WHEEL)
+"""Sensors with a level; their codes count from zero and are the rows of Core.trust."""
+
+_HEALTHY, _DEGRADED, _RECOVERED = int(Health.HEALTHY), int(Health.DEGRADED), int(Health.RECOVERED)
+_DEAD_RECKONING, _DIVERGED = int(Health.DEAD_RECKONING), int(Health.DIVERGED)
+_NONE, _SIGMA, _REJECTED, _TILTED = int(Cause.NONE), int(Cause.SIGMA), int(Cause.REJECTED), int(Cause.TILTED)
+_ABSENT, _STALE, _SUSPECT, _GOOD = (int(level) for level in Level)
+_GNSS, _YAW, _POSE = int(Sensor.GNSS_POSITION), int(Sensor.GNSS_YAW), int(Sensor.POSE_FIX)
+_COUNT = len(SOURCES)
+
+
+def begin(core: Core, now: int, before: Core | None) -> None:
+    """Set the clocks of a core that was aligned at now; before: the core that diverged, None: the first start."""
+    clock = core.health
+    clock[H_START] = clock[H_FED] = clock[H_HELD] = now
+    clock[H_STATE] = _HEALTHY
+    if before is not None:
+        clock[H_BACK], clock[H_RESTARTS] = now, before.health[H_RESTARTS] + 1
+        core.trust[:, T_SEEN], core.trust[:, T_GOOD] = before.trust[:, T_SEEN], before.trust[:, T_GOOD]
+        core.quietest[:] = before.quietest
+
+
+@kernel()
+def noted(
+    clock: Nanoseconds, trust: Nanoseconds, suspect: int, sensor: int, applied: bool, explained: bool, now: int
+) -> None:
+    """A measurement of one of SOURCES was judged: whether it was applied, and whether the state explains it.
+
+    clock, trust: Core.health and Core.trust.
+    """
+    trust[sensor, T_SEEN] = now
+    if explained:
+        trust[sensor, T_GOOD] = now
+        trust[sensor, T_DOUBT] = max(trust[sensor, T_DOUBT] - 1, 0)
+    else:
+        trust[sensor, T_DOUBT] = min(trust[sensor, T_DOUBT] + 1, 2 * suspect)
+    if sensor not in (_GNSS, _POSE):
+        return
+    if applied:
+        clock[H_FED] = now
+    if explained:
+        clock[H_HELD], clock[H_COUNT] = now, 0
+        return
+    if clock[H_COUNT] == 0:
+        clock[H_SINCE] = now
+    clock[H_COUNT] += 1
+    clock[H_LAST] = now
+
+
+@kernel()
+def level_of(trust: Nanoseconds, stale: int, suspect: int, sensor: int, now: int) -> int:
+    """The Level of one of SOURCES. trust: Core.trust; stale: after so many ns."""
+    if trust[sensor, T_SEEN] == trust[sensor, T_GOOD] < 0:
+        return _ABSENT
+    if now - trust[sensor, T_SEEN] > stale:
+        return _STALE
+    if trust[sensor, T_DOUBT] >= suspect or now - trust[sensor, T_GOOD] > stale:
+        return _SUSPECT
+    return _GOOD
+
+
+@kernel()
+def judge(core: Core, limits: HealthLimits, now: int) -> None:
+    """Bring the state of health and its cause up to now."""
+    clock = core.health
+    before = clock[H_STATE]
+    if core.P[8, 8] > limits.wide_yaw_var:
+        clock[H_WIDE] = now
+    cause = divergence(core, limits)
+    if cause != _NONE:
+        state = _DIVERGED
+    elif now - clock[H_FED] > limits.dead_reckoning_ns:
+        state = _DEAD_RECKONING
+    else:
+        if before in (_DIVERGED, _DEAD_RECKONING):
+            clock[H_BACK] = now
+        cause = _weakness(core, limits, now)
+        well = _RECOVERED if now - clock[H_BACK] <= limits.recovered_ns else _HEALTHY
+        state = well if cause == _NONE else _DEGRADED
+    clock[H_STATE], clock[H_CAUSE] = state, cause
+
+
+@kernel()
+def _weakness(core: Core, limits: HealthLimits, now: int) -> int:
+    """The Cause for which the state is less than healthy: the first sensor that is not good; NONE."""
+    for sensor in range(_COUNT):
+        if _ABSENT < level_of(core.trust, limits.stale_ns[sensor], limits.suspect, sensor, now) < _GOOD:
+            return sensor + 1
+    P = core.P
+    return _SIGMA if P[0, 0] + P[1, 1] > limits.sigma_var or P[8, 8] > limits.sigma_yaw_var else _NONE
+
+
+@kernel(inline="always")
+def questionable(clock: Nanoseconds, P: Floats, limits: HealthLimits) -> bool:
+    """Whether there is any need to ask ``hopeless``: positions of late were not explained, or P is wide or NaN."""
+    narrow = P[8, 8] <= limits.wide_yaw_var and P[0, 0] + P[1, 1] <= limits.blown_var
+    return bool(clock[H_COUNT] > 0 or not narrow)
+
+
+@kernel()
+def hopeless(core: Core, limits: HealthLimits, sensor: int, now: int) -> bool:
+    """Whether a position that comes now should rather begin a new alignment than be judged by this state.
+
+    sensor: GNSS position or pose fix. Not within a pause after a start, which grows with their number; and not for its
+    tilt, which gravity gives again.
+    """
+    clock, nav = core.health, core.nav
+    if core.P[8, 8] > limits.wide_yaw_var:
+        clock[H_WIDE] = now
+    if not limits.restart:
+        return False
+    if now - clock[H_START] < limits.pause_ns * (1 + clock[H_RESTARTS]):
+        return False
+    cause = divergence(core, limits)
+    if cause in (_NONE, _TILTED):
+        return False
+    judge(core, limits, now)
+    if cause != _REJECTED:
+        return True
+    # else the new yaw will be a course
+    has_yaw = sensor == _POSE or level_of(core.trust, limits.stale_ns[_YAW], limits.suspect, _YAW, now) > _STALE
+    if not has_yaw and nav[3] * nav[3] + nav[4] * nav[4] < limits.course_speed2:
+        return False
+    return bool(outweighed(core, limits))
