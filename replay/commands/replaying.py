@@ -47,6 +47,9 @@ class Replay:
         str | None, tyro.conf.arg(metavar="EVERY:LENGTH", help_behavior_hint="(default: hide nothing)")
     ] = None
     """Hide GNSS for LENGTH s every EVERY s, as in 60:15, and score against the RTK-fixed fixes that were hidden."""
+    inject: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
+    """Make sensors fail, as in gnss-jump:severe@60+20: NAME[:mild|medium|severe][@BEGIN[+LENGTH]] in s since the first
+    IMU sample; several with commas or --inject again. Names: docs/faults.md, or any other word."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
     """Logs replayed at a time, each in a process of its own."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")] = None
@@ -88,7 +91,7 @@ class Replay:
             raise EgolocError("--resume and --overwrite: expected one of them")
 
     def _settings(self) -> "RunConfig":
-        from replay.config import RunConfig, load_config, named_limits, parse_hide_gnss
+        from replay.config import RunConfig, load_config, named_limits, parse_hide_gnss, with_faults
 
         config = RunConfig() if self.config is None else load_config(self.config)
         if self.limits is not None:
@@ -97,7 +100,7 @@ class Replay:
             config = msgspec.structs.replace(config, hide_gnss=parse_hide_gnss(self.hide_gnss))
         if self.reference is not None and config.hide_gnss is not None:
             raise EgolocError("--hide-gnss scores against the hidden fixes: leave out --reference")
-        return config
+        return with_faults(config, self.inject or config.inject)
 
     def _keep(self) -> Any:
         from replay.store import Keep
