@@ -1,12 +1,13 @@
 """What becomes of the filter when a sensor fails: one fault in the middle of a simulated drive, against its truth.
 
-Drives are those of `clean`: white errors, so that what is seen is the fault's own. The fault begins in motion. Judged is
-the time from its begin to the end of the drive, with the limits of a run.
+Drives are those of `clean`: white errors, so that what is seen is the fault's own. The fault begins in motion. Judged
+is the time from its begin to the end of the drive, with the limits of a run.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from sensors.simulate.faults.spec import Injection
 
 Floats = NDArray[np.float64]
 
+_DEFAULT = FusionConfig()
 SENSOR_SETS: Mapping[str, tuple[str, ...]] = {
     "all sensors": ("imu", "gnss", "gnss_velocity", "pose_fixes", "wheel"),
     "without pose fixes": ("imu", "gnss", "gnss_velocity", "wheel"),
@@ -50,14 +52,14 @@ class Subject:
     sensors: str
     begin_s: float
     seed: int
-    config: FusionConfig = FusionConfig()
+    config: FusionConfig = _DEFAULT
     limits: Limits = LIMITS["paper"]
 
     @cached_property
     def log(self) -> Log:
         """What of the drive the filter gets."""
-        others = {"gnss", "gnss_velocity", "pose_fixes", "wheel"} - set(SENSOR_SETS[self.sensors])
-        return replace(self.drive.log, reference=None, **dict.fromkeys(others))
+        given: dict[str, Any] = {name: getattr(self.drive.log, name) for name in SENSOR_SETS[self.sensors]}
+        return Log(**given, vehicle=self.drive.log.vehicle, map_frame=self.drive.log.map_frame)
 
     @cached_property
     def unharmed(self) -> Floats:

@@ -49,19 +49,31 @@ class View:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure speed side by side with other libraries, in one run on one core."""
+    """Measure speed side by side with other libraries, in one run on one core; or what becomes of failing sensors."""
 
-    name: tyro.conf.Positional[Literal["filter", "replay", "mcap"]]
-    """filter: IMU steps/s of the filter; replay: an hour of log to metrics.json; mcap: IMU messages/s read."""
+    name: tyro.conf.Positional[Literal["filter", "replay", "mcap", "faults"]]
+    """filter: IMU steps/s of the filter; replay: an hour of log to metrics.json; mcap: IMU messages/s read; faults:
+    errors, recovery and warnings for every fault that --inject knows, on simulated drives."""
     repeats: int = 5
     """Timed calls of each row, after one that warms up; the median counts."""
     hours: tuple[float, ...] = (1.0,)
     """Lengths of the log, h (replay only): figures of each and how the time grows."""
+    drives: int = 4
+    """Simulated drives (faults only); figures are the worst of them."""
+    seed: int = 4000
+    """Seed of the first of them (faults only)."""
+    short: bool = False
+    """One drive and the medium severity alone (faults only)."""
+    markdown: Annotated[Path | None, tyro.conf.arg(metavar="FILE.md", help_behavior_hint="(default: none)")] = None
+    """Write the tables there as well (faults only)."""
     json: bool = False
     """Print JSON."""
 
     def run(self, _: tuple[str, ...]) -> None:
         """Run one benchmark."""
+        if self.name == "faults":
+            self._faults()
+            return
         from replay.bench.measure import one_core
 
         options = {"hours": self.hours} if self.name == "replay" else {}
@@ -73,6 +85,22 @@ class Bench:
         from replay.table import bench_table, output_console
 
         output_console().print(bench_table(result))
+
+    def _faults(self) -> None:
+        from replay.bench import faults
+        from replay.fault_tables import fault_tables, markdown
+        from replay.table import output_console
+
+        if self.drives < 1 or self.seed < 0:
+            raise EgolocError(f"bench: --drives, --seed: expected 1 or more, 0 or more, got {self.drives}, {self.seed}")
+        with stage("benchmark faults") as tell:
+            found = faults.matrix_of(self.drives, self.seed, short=self.short, tell=tell)
+        if self.markdown is not None:
+            self.markdown.write_text(markdown(found))
+        if self.json:
+            print_json(faults.report(found))
+        else:
+            output_console().print(fault_tables(found))
 
 
 def check_no_campaign(folder: Path) -> None:
