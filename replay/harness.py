@@ -81,7 +81,7 @@ def _stream(
     source: LogSource, config: RunConfig, reference_file: Path | None, tables: Tables, progress: Progress | None
 ) -> tuple[Drive, "Sums"]:
     """Every piece through the filter into the tables; the drive at its end, and its sums."""
-    injector = Injector(parse_faults(config.inject), config.seed)
+    injector = Injector(parse_faults(config.inject), config.seed, f"{source.where}: --inject")
     pieces = injector.pieces(_pieces(source, config))
     first = next(pieces, Log())
     drive = Drive(first, config, source.where, reference_file, injector.injections, all_columns=tables.holds_decisions)

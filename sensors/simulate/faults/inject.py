@@ -25,8 +25,9 @@ from sensors.simulate.noise import stream
 class Injector:
     """Faults for one drive, in the order in which they are given. What is random in them is drawn by the seed."""
 
-    def __init__(self, injections: Sequence[Injection], seed: int = 0) -> None:
-        self.injections = tuple(injections)
+    def __init__(self, injections: Sequence[Injection], seed: int = 0, where: str = "--inject") -> None:
+        """where: how messages begin."""
+        self.injections, self._where = tuple(injections), where
         self.met: list[Counter[str]] = [Counter() for _ in injections]
         """How many rows of each record each fault met."""
         self._back_ns = sum(round(one.fault.size(one.severity) * NS_PER_S) for one in injections if one.fault.back)
@@ -105,7 +106,7 @@ class Injector:
         for one, met in zip(self.injections, self.met, strict=True):
             if not met.total():
                 wanted = " or ".join(name.replace("_", " ") for name in one.fault.acts)
-                raise EgolocError(f"--inject: {one.spec}: expected {wanted} in that time of the drive, found none")
+                raise EgolocError(f"{self._where}: {one.spec}: expected {wanted} in that time of the drive, found none")
 
 
 def _complete_ns(piece: Log) -> int:
