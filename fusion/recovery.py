@@ -6,24 +6,49 @@ sensors that say the same place, while neither was accepted in between, outvote 
 
 import math
 
-from fusion._linalg import Vector, attitude, matvec
+from fusion._linalg import Quaternion, Vector, attitude, matvec, multiply
 from fusion.events import Parameters
+from fusion.gating import inject
 from fusion.measurements import Pair
-from fusion.state import D_AGREED, D_COUNT, D_TIME, E_WHEEL_SCALE, Core, Floats
+from fusion.mechanization import refresh
+from fusion.state import (
+    C_COUNT,
+    D_AGREED,
+    D_COUNT,
+    D_GAVE,
+    D_TIME,
+    E_WHEEL_SCALE,
+    ERROR_SIZE,
+    RING_SIZE,
+    WHEEL_SCALE,
+    Core,
+    Floats,
+)
 from sensors.kernel import kernel
 
 FRESH_NS = 500_000_000
 """Rejections of both sensors within this belong together."""
 AGREEING = 2.3
 """Largest squared distance of what they say, in variances as the filter inflates them: a quarter of 99 %."""
+FAR_SHARE, FAR_M = 0.1, 3.0
+"""Innovations agree also where they differ by such a share of what they exceed FAR_M by: a state that is far off has a
+wrong attitude as well, which moves the antenna against the camera, and runs away between the two, -, m."""
 VAGUE_VAR = 0.3**2
 """Sensors that know less than this together agree by chance, m^2."""
 VELOCITY_VAR = 1.0**2
 """Doubt of the velocity, (m/s)^2."""
 ATTITUDE_VAR = 0.02**2
 """Doubt of the attitude, rad^2."""
+TILT_PER_SPEED = 1.0 / 20.0
+"""Velocity that is off by so much comes of such a tilt over the two seconds that a vote takes, rad per m/s."""
+MOST_TILT_VAR = 0.5**2
+"""But of no more than this, rad^2."""
 WHEEL_SCALE_VAR = 0.02**2
 """Doubt of the wheel's scale."""
+AGAIN_NS = 10_000_000_000
+"""A state that is outvoted again within this is not mended by a wider P: it starts again."""
+START_VARS = (2.0**2, 2.0**2, 0.15**2, 0.05**2, 0.01**2, 0.3**2)
+"""Then: position m^2, velocity (m/s)^2, tilt and yaw rad^2, gyro bias (rad/s)^2, accelerometer bias (m/s^2)^2."""
 
 
 @kernel()
@@ -70,11 +95,19 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     east -= other[0] + age * other[6] + sign * east_apart
     north -= other[1] + age * other[7] + sign * north_apart
     ee, en, nn = mine[3] + other[3], mine[4] + other[4], mine[5] + other[5]
+    sharp = ee + nn <= VAGUE_VAR
+    far = FAR_SHARE * max(math.hypot(other[0], other[1]) - FAR_M, 0.0)
+    ee += far * far
+    nn += far * far
     distance = (nn * east * east - 2.0 * en * east * north + ee * north * north) / (ee * nn - en * en)
-    agree = distance <= AGREEING and ee + nn <= VAGUE_VAR
+    agree = distance <= AGREEING and sharp
     clock[0, D_AGREED] = max(clock[0, D_AGREED] + (1 if agree else -2), 0)
     if clock[0, D_AGREED] >= par.outvoted:
-        _give_way(core.P, doubt)
+        if now - clock[1, D_GAVE] <= AGAIN_NS:
+            _start_again(core, par, now)
+        else:
+            _give_way(core.P, doubt)
+        clock[1, D_GAVE] = now
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
 
 
@@ -89,13 +122,67 @@ def _apart_by_yaw(core: Core, par: Parameters, yaw: float) -> Pair:
 
 @kernel()
 def _give_way(P: Floats, doubt: Floats) -> None:
-    """Widen P to what both sensors say."""
+    """Widen P to what both sensors say: how far off the state is, and how fast it runs away."""
     place = doubt[1, 0] * doubt[1, 0] + doubt[1, 1] * doubt[1, 1]
     P[0, 0] += place
     P[1, 1] += place
     P[2, 2] += doubt[0, 2] * doubt[0, 2]
+    run = doubt[0, 6] * doubt[0, 6] + doubt[0, 7] * doubt[0, 7]
     for i in range(3):
-        P[3 + i, 3 + i] += VELOCITY_VAR
-        P[6 + i, 6 + i] += ATTITUDE_VAR
+        P[3 + i, 3 + i] += VELOCITY_VAR + run
+        P[6 + i, 6 + i] += ATTITUDE_VAR + min(run * TILT_PER_SPEED * TILT_PER_SPEED, MOST_TILT_VAR)
     P[E_WHEEL_SCALE, E_WHEEL_SCALE] += WHEEL_SCALE_VAR
     P[8, 8] += doubt[1, 2] * doubt[1, 2]
+
+
+@kernel()
+def _start_again(core: Core, par: Parameters, now: int) -> None:
+    """A new state where both sensors say: levelled by the force since a second, yaw of the pose fix, no biases.
+
+    The speed is the state's and that at which it runs away from them. Nothing that P knew is kept.
+    """
+    nav, P, dx, doubt = core.nav, core.P, core.dx, core.doubt
+    r = attitude(nav)
+    yaw = math.atan2(r[3], r[0]) + doubt[1, 2]
+    for i in range(ERROR_SIZE):
+        dx[i] = 0.0
+        for j in range(P.shape[1]):
+            P[i, j] = 0.0
+    dx[0], dx[1], dx[2] = doubt[0, 0], doubt[0, 1], doubt[0, 2]
+    dx[3], dx[4], dx[5] = doubt[0, 6], doubt[0, 7], -nav[5]
+    inject(nav, core.earth, dx)
+    refresh(nav, core.earth)
+    nav[6], nav[7], nav[8], nav[9] = _levelled(_mean_force(core, par.still_window_ns, now), yaw)
+    for i in range(10, 16):
+        nav[i] = 0.0
+    nav[WHEEL_SCALE] = 0.0
+    for i in range(3):
+        P[i, i], P[3 + i, 3 + i], P[6 + i, 6 + i] = START_VARS[0], START_VARS[1], START_VARS[2]
+        P[9 + i, 9 + i], P[12 + i, 12 + i] = START_VARS[4], START_VARS[5]
+    P[8, 8] = START_VARS[3]
+    P[E_WHEEL_SCALE, E_WHEEL_SCALE] = WHEEL_SCALE_VAR
+
+
+@kernel()
+def _mean_force(core: Core, window_ns: int, now: int) -> Vector:
+    """Of the IMU samples of a window before now, body axes, m/s^2."""
+    x, y, z = 0.0, 0.0, 0.0
+    count = core.clock[C_COUNT]
+    for back in range(min(count, RING_SIZE)):
+        i = (count - 1 - back) % RING_SIZE
+        if back > 0 and core.ring_t[i] <= now - window_ns:
+            break
+        x, y, z = x + core.ring[i, 3], y + core.ring[i, 4], z + core.ring[i, 5]
+    return x, y, z
+
+
+@kernel()
+def _levelled(force: Vector, yaw: float) -> Quaternion:
+    """q_enu_body with the force upwards and a yaw from east."""
+    x, y, z = force
+    roll, pitch = math.atan2(y, z), math.atan2(-x, math.hypot(y, z))
+    about_x: Quaternion = (math.sin(0.5 * roll), 0.0, 0.0, math.cos(0.5 * roll))
+    about_y: Quaternion = (0.0, math.sin(0.5 * pitch), 0.0, math.cos(0.5 * pitch))
+    about_z: Quaternion = (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
+    q: Quaternion = multiply(multiply(about_z, about_y), about_x)
+    return q

@@ -57,6 +57,8 @@ G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8
 
 # entries of Core.doubt_clock
 D_COUNT, D_TIME, D_AGREED = range(3)
+D_GAVE = D_AGREED
+"""In the second row: when the state gave way last, ns."""
 
 # entries of Core.clock
 C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)

@@ -31,6 +31,8 @@ FASTEST_SPEED = 150.0
 LOST_NS = 10 * NS_PER_S
 LOST_COUNT = 10
 """So many positions over so long, each rejected by the chi-square gate: the filter no longer knows where it is."""
+BOTH_LOST_NS = NS_PER_S
+"""Positions of two sensors need not be rejected for longer than this: hardly both are wrong at once."""
 INERT_SHARE = 0.5
 """A sensor with more of its measurements rejected than this says something about itself or the filter."""
 
@@ -87,13 +89,14 @@ class Watch:
         self._counts += np.bincount(pairs, minlength=self._counts.size).reshape(self._counts.shape)
         rows = np.flatnonzero(_IS_POSITION[decisions.sensor] & _IS_JUDGED[decisions.reason])
         rows = rows[np.argsort(decisions.t_ns[rows], kind="stable")]
+        pose_fixes = np.cumsum(np.append(0, decisions.sensor[rows] == Sensor.POSE_FIX))
         t_ns, rejected = decisions.t_ns[rows], decisions.reason[rows] == Reason.CHI_SQUARE
         edges = np.flatnonzero(np.diff(rejected.astype(np.int8), prepend=0, append=0))
         for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            goes_on = first == 0 and self._run.count > 0
-            start_ns = self._run.start_ns if goes_on else int(t_ns[first])
-            self._run = _Run((self._run.count if goes_on else 0) + end - first, start_ns, int(t_ns[end - 1]))
-            self._longest = max(self._longest, self._run, key=lambda run: run.count)
+            before = self._run if first == 0 and self._run.count else _Run(start_ns=int(t_ns[first]))
+            of_pose = before.pose_fixes + int(pose_fixes[end] - pose_fixes[first])
+            self._run = _Run(before.count + end - first, before.start_ns, int(t_ns[end - 1]), of_pose)
+            self._longest = max(self._longest, self._run, key=lambda run: (run.is_lost, run.count))
         if len(rejected) and not rejected[-1]:
             self._run = _Run()
 
@@ -118,7 +121,7 @@ class Watch:
     def _lost(self, start_ns: int) -> str:
         """The longest time over which every position was rejected."""
         run = self._longest
-        if run.count < LOST_COUNT or run.end_ns - run.start_ns < LOST_NS:
+        if not run.is_lost:
             return ""
         start, end = ((t - start_ns) / NS_PER_S for t in (run.start_ns, run.end_ns))
         return f"The filter lost track: from {start:.1f} to {end:.1f} s it rejected all {run.count} positions."
@@ -135,11 +138,18 @@ class Watch:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """Positions rejected one after the other, and the times of the first and the last."""
+    """Positions rejected one after the other, the times of the first and the last, and how many were pose fixes."""
 
     count: int = 0
     start_ns: int = 0
     end_ns: int = 0
+    pose_fixes: int = 0
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it is too long to be the sensors' fault."""
+        both = 0 < self.pose_fixes < self.count
+        return self.count >= LOST_COUNT and self.end_ns - self.start_ns >= (BOTH_LOST_NS if both else LOST_NS)
 
 
 class ImuWatch:
