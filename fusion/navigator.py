@@ -17,6 +17,7 @@ from fusion.mechanization import refresh
 from fusion.recording import decisions, join, states, unused
 from fusion.result import Decisions, Reason, States
 from fusion.sources import APPLY, RECORDS, joined, sources, split
+from fusion.spikes import SpikeGate
 from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, Core, new_core
 from fusion.timeline import merge, parameters
 from sensors import pieces
@@ -45,6 +46,7 @@ class Navigator:
         self._rows = dict.fromkeys(RECORDS, 0)
         self._imu: list[Imu] = []
         """Samples after the state; before alignment those before it as well, as far as they are kept."""
+        self.spikes = SpikeGate(config.imu)
         self._decisions: list[Decisions] = []
         self._states: list[States] = []
         self.pending = self._nothing = sources(self._empty, config)
@@ -72,7 +74,7 @@ class Navigator:
             raise EgolocError(f"Imu.t_ns: expected increasing stamps, got {imu.t_ns[0]} after {self.last_imu_ns}")
         self._first_imu_ns = self._aligner.first_imu_ns = min(self._first_imu_ns, int(imu.t_ns[0]))
         self.last_imu_ns = int(imu.t_ns[-1])
-        self._imu.append(imu)
+        self._imu.append(self.spikes.passed(imu))
 
     def advance(self, known_ns: int) -> None:
         """Go on to known_ns at most, the time up to which every measurement has been added."""
