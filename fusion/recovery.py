@@ -45,6 +45,8 @@ MOST_TILT_VAR = 0.5**2
 """But of no more than this, rad^2."""
 WHEEL_SCALE_VAR = 0.02**2
 """Doubt of the wheel's scale."""
+UPWARDS_RATE = 10.0
+"""Rejections of a receiver come so often, roughly: how far the height runs away between two tells its speed, 1/s."""
 AGAIN_NS = 10_000_000_000
 """A state that is outvoted again within this is not mended by a wider P: it starts again."""
 START_VARS = (2.0**2, 2.0**2, 0.15**2, 0.05**2, 0.01**2, 0.3**2)
@@ -75,6 +77,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     c, s = ahead
     R, doubt, clock = core.R, core.doubt, core.doubt_clock
     mine, other = doubt[which], doubt[1 - which]
+    climb = z[2] - mine[2] if which == 0 and clock[0, D_COUNT] > 0 else 0.0
     east, north = c * z[0] - s * z[1], s * z[0] + c * z[1]
     mine[6] = mine[7] = 0.0
     if clock[which, D_COUNT] > 0 and 0 < now - clock[which, D_TIME] <= FRESH_NS:
@@ -88,6 +91,9 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     clock[which, D_TIME] = now
     if clock[1 - which, D_COUNT] == 0 or now - clock[1 - which, D_TIME] > FRESH_NS:
         clock[0, D_AGREED] = 0
+        if which == 0 and clock[0, D_COUNT] >= par.outvoted and _fits_but_for_height(core, par, z):
+            _give_way_upwards(core.P, z[2], climb)
+            clock[0, D_COUNT] = 0
         return
     age = (now - clock[1 - which, D_TIME]) * 1e-9
     east_apart, north_apart = _apart_by_yaw(core, par, doubt[1, 2])
@@ -118,6 +124,24 @@ def _apart_by_yaw(core: Core, par: Parameters, yaw: float) -> Pair:
     arm = matvec(attitude(core.nav), (a[0] - b[0], a[1] - b[1], a[2] - b[2]))
     c, s = math.cos(yaw) - 1.0, math.sin(yaw)
     return c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]
+
+
+@kernel()
+def _fits_but_for_height(core: Core, par: Parameters, z: Vector) -> bool:
+    """Whether a rejected GNSS position would pass the gate without its height: nothing else says anything of that."""
+    P, R = core.P, core.R
+    ee, en, nn = P[0, 0] + R[0, 0], P[0, 1] + R[0, 1], P[1, 1] + R[1, 1]
+    distance = (nn * z[0] * z[0] - 2.0 * en * z[0] * z[1] + ee * z[1] * z[1]) / (ee * nn - en * en)
+    fits: bool = distance <= par.gate[1]
+    return fits
+
+
+@kernel()
+def _give_way_upwards(P: Floats, up: float, climb: float) -> None:
+    """Widen the height by how far it is off, m, the rest by what may have caused it. climb: since the last, m."""
+    P[2, 2] += up * up
+    P[5, 5] += VELOCITY_VAR + (climb * UPWARDS_RATE) ** 2
+    P[14, 14] += START_VARS[5]
 
 
 @kernel()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fusion.recovery import _levelled
+from fusion.result import Reason, Sensor
 from fusion.run import run
 from sensors.records import Imu, Log
 from sensors.rotation import q_from_rpy, rotate
@@ -40,7 +41,6 @@ def with_imu(drive: Drive, begin: float, gyro_deg: tuple[float, ...], accel_scal
         ((3.0, 3.0, 3.0), (1.0, 1.0, 1.0)),
         ((0.0, 0.0, 10.0), (1.0, 1.0, 1.0)),
         ((20.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
-        ((0.0, 0.0, 0.0), (1.0, 1.0, 0.7)),
     ],
 )
 def test_an_imu_that_was_wrong_is_recovered_from(
@@ -55,6 +55,21 @@ def test_an_imu_that_was_wrong_is_recovered_from(
     print(f"largest {largest.round(2)}")
     assert (largest > LIMITS).any()
     assert (errors[s > begin + LENGTH_S + BACK_S] < LIMITS).all()
+
+
+def test_a_height_that_runs_away_is_brought_back(drive: Drive) -> None:
+    """Pose fixes hold the place, and all GNSS positions are rejected for their height alone: nothing else knows it."""
+    begin = moving_at(drive, 5.0)
+    log = with_imu(drive, begin, (0.0, 0.0, 0.0), (1.0, 1.0, 0.7))
+    result = run(log)
+    s, errors = seconds(log, result.states.t_ns), np.abs(fused_errors(result, drive))
+    assert (errors[s > begin] < LIMITS).all()
+    high = np.abs(result.states.llh[:, 2] - drive.truth.at(result.states.t_ns).llh[:, 2])
+    assert high[(s > begin) & (s < begin + LENGTH_S)].max() > 2.0
+    assert high[s > begin + LENGTH_S + BACK_S].max() < 0.2
+    gnss = result.decisions.sensor == Sensor.GNSS_POSITION
+    late = seconds(log, result.decisions.t_ns[gnss]) > begin + LENGTH_S + BACK_S
+    assert (result.decisions.reason[gnss][late] == Reason.ACCEPTED).mean() > 0.99
 
 
 @pytest.mark.parametrize(("roll", "pitch", "yaw"), [(0.0, 0.0, 0.3), (0.2, -0.1, 2.0), (-0.4, 0.3, -3.0)])
