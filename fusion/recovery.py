@@ -1,7 +1,8 @@
 """Back from a wrong state: when GNSS positions and pose fixes are both rejected and agree, the state gives way.
 
 A rejection alone proves nothing: a wrong fix and an alias of the map are as steady as the truth. Two independent
-sensors that say the same place, while neither was accepted in between, outvote the state.
+sensors that say the same place, while neither was accepted in between, outvote the state. Outvoted again soon, it
+starts again.
 """
 
 import math
@@ -9,7 +10,7 @@ import math
 from fusion._linalg import Quaternion, Vector, attitude, matvec, multiply
 from fusion.events import Parameters
 from fusion.gating import inject
-from fusion.measurements import Pair
+from fusion.measurements import Pair, wrap
 from fusion.mechanization import refresh
 from fusion.state import (
     C_COUNT,
@@ -20,7 +21,6 @@ from fusion.state import (
     E_WHEEL_SCALE,
     ERROR_SIZE,
     RING_SIZE,
-    WHEEL_SCALE,
     Core,
     Floats,
 )
@@ -45,6 +45,8 @@ MOST_TILT_VAR = 0.5**2
 """But of no more than this, rad^2."""
 WHEEL_SCALE_VAR = 0.02**2
 """Doubt of the wheel's scale."""
+COURSE_SPEED, COURSE_NEAR = 3.0, 0.05
+"""At this speed and more a vehicle's course is its yaw to within so much, m/s, rad."""
 UPWARDS_RATE = 10.0
 """Rejections of a receiver come so often, roughly: how far the height runs away between two tells its speed, 1/s."""
 AGAIN_NS = 10_000_000_000
@@ -91,9 +93,14 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     clock[which, D_TIME] = now
     if clock[1 - which, D_COUNT] == 0 or now - clock[1 - which, D_TIME] > FRESH_NS:
         clock[0, D_AGREED] = 0
-        if which == 0 and clock[0, D_COUNT] >= par.outvoted and _fits_but_for_height(core, par, z):
-            _give_way_upwards(core.P, z[2], climb)
-            clock[0, D_COUNT] = 0
+        if not (_fits_but_for_height(core, par, z) if which == 0 else _fits_but_for_yaw(core, par, z)):
+            clock[which, D_COUNT] = max(clock[which, D_COUNT] - 2, 1)
+        elif clock[which, D_COUNT] >= par.outvoted:
+            if which == 0:
+                _give_way_upwards(core.P, z[2], climb)
+            else:
+                _give_way_turning(core.P, z[2])
+            clock[which, D_COUNT] = 0
         return
     age = (now - clock[1 - which, D_TIME]) * 1e-9
     east_apart, north_apart = _apart_by_yaw(core, par, doubt[1, 2])
@@ -137,6 +144,30 @@ def _fits_but_for_height(core: Core, par: Parameters, z: Vector) -> bool:
 
 
 @kernel()
+def _fits_but_for_yaw(core: Core, par: Parameters, z: Vector) -> bool:
+    """Whether a rejected pose fix would pass the gate without its yaw, and the course of the state, which GNSS holds
+    by then, is on its side: a map's alias turns nothing that moves."""
+    nav, P, R = core.nav, core.P, core.R
+    speed = math.hypot(nav[3], nav[4])
+    r = attitude(nav)
+    course = math.atan2(nav[4], nav[3]) - math.atan2(r[3], r[0])
+    var = P[0, 0] + P[1, 1] + R[0, 0] + R[1, 1]
+    fits = z[0] * z[0] + z[1] * z[1] <= par.gate[1] * var and speed >= COURSE_SPEED
+    turned: bool = abs(wrap(course - z[2])) <= COURSE_NEAR and abs(wrap(course)) > COURSE_NEAR
+    return fits and turned
+
+
+@kernel()
+def _give_way_turning(P: Floats, turn: float) -> None:
+    """Widen the yaw by how far it is off, rad, the gyro's bias, which may have turned it over the two seconds of a vote,
+    and the tilt, which went through the same turn."""
+    P[8, 8] += turn * turn + ATTITUDE_VAR
+    P[11, 11] += 0.25 * turn * turn
+    P[6, 6] += ATTITUDE_VAR
+    P[7, 7] += ATTITUDE_VAR
+
+
+@kernel()
 def _give_way_upwards(P: Floats, up: float, climb: float) -> None:
     """Widen the height by how far it is off, m, the rest by what may have caused it. climb: since the last, m."""
     P[2, 2] += up * up
@@ -163,7 +194,8 @@ def _give_way(P: Floats, doubt: Floats) -> None:
 def _start_again(core: Core, par: Parameters, now: int) -> None:
     """A new state where both sensors say: levelled by the force since a second, yaw of the pose fix, no biases.
 
-    The speed is the state's and that at which it runs away from them. Nothing that P knew is kept.
+    The speed is the state's and that at which it runs away from them. Of P only the block behind the biases is kept
+    (the wheel's scale), in doubt.
     """
     nav, P, dx, doubt = core.nav, core.P, core.dx, core.doubt
     r = attitude(nav)
@@ -171,7 +203,8 @@ def _start_again(core: Core, par: Parameters, now: int) -> None:
     for i in range(ERROR_SIZE):
         dx[i] = 0.0
         for j in range(P.shape[1]):
-            P[i, j] = 0.0
+            if i < E_WHEEL_SCALE or j < E_WHEEL_SCALE:
+                P[i, j] = 0.0
     dx[0], dx[1], dx[2] = doubt[0, 0], doubt[0, 1], doubt[0, 2]
     dx[3], dx[4], dx[5] = doubt[0, 6], doubt[0, 7], -nav[5]
     inject(nav, core.earth, dx)
@@ -179,12 +212,11 @@ def _start_again(core: Core, par: Parameters, now: int) -> None:
     nav[6], nav[7], nav[8], nav[9] = _levelled(_mean_force(core, par.still_window_ns, now), yaw)
     for i in range(10, 16):
         nav[i] = 0.0
-    nav[WHEEL_SCALE] = 0.0
     for i in range(3):
         P[i, i], P[3 + i, 3 + i], P[6 + i, 6 + i] = START_VARS[0], START_VARS[1], START_VARS[2]
         P[9 + i, 9 + i], P[12 + i, 12 + i] = START_VARS[4], START_VARS[5]
     P[8, 8] = START_VARS[3]
-    P[E_WHEEL_SCALE, E_WHEEL_SCALE] = WHEEL_SCALE_VAR
+    P[E_WHEEL_SCALE, E_WHEEL_SCALE] += WHEEL_SCALE_VAR
 
 
 @kernel()

@@ -16,7 +16,7 @@ from tests.fusion.rough import LIMITS, fused_errors
 from tests.fusion.scenes import seconds
 from tests.fusion.test_robustness import moving_at
 
-LENGTH_S, BACK_S = 10.0, 15.0
+LENGTH_S, BACK_S = 10.0, 10.0
 
 
 @pytest.fixture(scope="module")
