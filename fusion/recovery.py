@@ -159,8 +159,8 @@ def _fits_but_for_yaw(core: Core, par: Parameters, z: Vector) -> bool:
 
 @kernel()
 def _give_way_turning(P: Floats, turn: float) -> None:
-    """Widen the yaw by how far it is off, rad, the gyro's bias, which may have turned it over the two seconds of a vote,
-    and the tilt, which went through the same turn."""
+    """Widen the yaw by how far it is off, rad, the gyro's bias, which may have turned it while votes were counted, and
+    the tilt, which went through the same turn."""
     P[8, 8] += turn * turn + ATTITUDE_VAR
     P[11, 11] += 0.25 * turn * turn
     P[6, 6] += ATTITUDE_VAR
