@@ -112,7 +112,7 @@ class TestNoSuccess:
         done = replayed(at("a.mcap"))
         assert done.error == ""
         assert done.warnings()[0] == kind
-        assert "rejected" in done.warnings()
+        assert {"lost", "rejected"} & set(done.warnings())  # it starts again and again, and is lost in between
         assert text in done.text
         assert main(["info", str(at("a.mcap"))]) == 0
         assert text in " ".join(capsys.readouterr().out.split())
