@@ -38,6 +38,10 @@ class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     noise_scale: NonNegative = 2.0
     """White noise of gyro and accelerometer, times the datasheet's (vibration, quantization), -."""
+    spike_rate_deg: Positive = 30.0
+    """A rate that differs by more from the sample before and the one after is a spike, and not used, deg/s."""
+    spike_force: Positive = 50.0
+    """The same for the specific force, m/s^2."""
     max_gap_s: Positive = 0.5
     """A longer pause in the IMU is a gap: P widens, no motion updates, s."""
     max_bridge_s: Positive = 3.0

@@ -16,6 +16,7 @@ from fusion.mechanization import refresh
 from fusion.recording import decisions, join, states, unused
 from fusion.result import Decisions, Reason, Restart, States
 from fusion.sources import APPLY, RECORDS, Sources, joined, parts, sources, split
+from fusion.spikes import SpikeGate
 from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, ERROR_SIZE, H_CAUSE, NAV_SIZE, Core, Floats, new_core
 from fusion.timeline import merge, parameters
 from sensors import pieces
@@ -44,6 +45,7 @@ class Navigator:
         self._rows = dict.fromkeys(RECORDS, 0)
         self._imu: list[Imu] = []
         """Samples after the state; before alignment those before it as well, as far as they are kept."""
+        self.spikes = SpikeGate(config.imu)
         self._decisions: list[Decisions] = []
         self._states: list[States] = []
         self._restarts: list[Restart] = []
@@ -79,7 +81,7 @@ class Navigator:
     def _add_imu(self, imu: Imu) -> None:
         self._check_rising(imu)
         self._first_imu_ns = self._aligner.first_imu_ns = min(self._first_imu_ns, int(imu.t_ns[0]))
-        self._imu.append(imu)
+        self._imu.append(self.spikes.passed(imu))
 
     def _check_rising(self, imu: Imu) -> None:
         """Raise unless the samples go on; they are the last ones from now on."""

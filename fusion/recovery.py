@@ -3,39 +3,36 @@
 A rejection alone proves nothing: a wrong fix and an alias of the map are as steady as the truth. Two independent
 sensors that say the same place, while neither was accepted in between, outvote the state. Where GNSS is alone the
 state's confidence decays as long as it is contradicted: what is little off is soon believed, a wrong fix a hundred
-sigmas away not before it has ended.
+sigmas away not before it has ended. Height and yaw, of which one sensor alone may know, give way to it where all else
+fits. Outvoted again soon, the state starts again.
 """
 
 import math
 
 from fusion._linalg import Vector, attitude, matvec
 from fusion.events import Parameters
-from fusion.measurements import Pair
-from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_SINCE, D_STREAK, D_TIME, E_WHEEL_SCALE, Core, Floats
+from fusion.giving_way import doubt_all, forget, give_way, give_way_turning, give_way_upwards, start_again
+from fusion.measurements import Pair, wrap
+from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_GAVE, D_SINCE, D_STREAK, D_TIME, Core
 from sensors.kernel import kernel
 
 FRESH_NS = 500_000_000
 """Rejections of both sensors within this belong together."""
 AGREEING = 9.2
 """Largest squared distance of what they say, in their variances: 99 %."""
+FAR_SHARE, FAR_M = 0.1, 3.0
+"""Innovations agree also where they differ by such a share of what they exceed FAR_M by: a state that is far off has a
+wrong attitude as well, which moves the antenna against the camera, and runs away between the two, -, m."""
 VAGUE_VAR = 0.15**2
 """Sensors that know less than this together agree by chance, m^2."""
-VELOCITY_VAR = 1.0**2
-"""Doubt of the velocity, (m/s)^2."""
-ATTITUDE_VAR = 0.02**2
-"""Doubt of the attitude, rad^2."""
 ALONE_NS = 2_000_000_000
 """GNSS is alone when no pose fix came for so long."""
-ALONE_DOUBLING_S = 4.0
-"""GNSS alone, rejected all the time: the state's sigmas double in this time."""
 LONG_NS = 8_000_000_000
 """After so long the biases are doubted as well."""
-GYRO_BIAS_VAR = 0.0005**2
-"""Doubt of the gyro's bias, (rad/s)^2."""
-ACCEL_BIAS_VAR = 0.05**2
-"""Doubt of the accelerometer's bias, (m/s^2)^2."""
-WHEEL_SCALE_VAR = 0.02**2
-"""Doubt of the wheel's scale."""
+COURSE_SPEED, COURSE_NEAR = 3.0, 0.05
+"""At this speed and more a vehicle's course is its yaw to within so much, m/s, rad."""
+AGAIN_NS = 10_000_000_000
+"""A state that is outvoted again within this is not mended by a wider P: it starts again."""
 
 
 @kernel()
@@ -64,6 +61,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     c, s = ahead
     R, doubt, clock = core.R, core.doubt, core.doubt_clock
     mine, other = doubt[which], doubt[1 - which]
+    climb = z[2] - mine[2] if which == 0 and clock[0, D_COUNT] > 0 else 0.0
     east, north = c * z[0] - s * z[1], s * z[0] + c * z[1]
     mine[6] = mine[7] = 0.0
     if clock[which, D_COUNT] > 0 and 0 < now - clock[which, D_TIME] <= FRESH_NS:
@@ -75,14 +73,22 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     mine[5] = s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1]
     if which == 0 and clock[0, D_COUNT] > 0 and now - max(clock[1, D_TIME], clock[1, D_BELIEVED]) > ALONE_NS:
         if clock[0, D_TIME] - clock[0, D_SINCE] < LONG_NS <= now - clock[0, D_SINCE]:
-            _doubt_all(core.P)
-        _forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9)
+            doubt_all(core.P)
+        forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9)
     if clock[which, D_COUNT] == 0:
         clock[which, D_SINCE] = now
     clock[which, D_COUNT] += 1
     clock[which, D_TIME] = now
     if clock[1 - which, D_COUNT] == 0 or now - clock[1 - which, D_TIME] > FRESH_NS:
         clock[0, D_AGREED] = 0
+        if not (_fits_but_for_height(core, par, z) if which == 0 else _fits_but_for_yaw(core, par, z)):
+            clock[which, D_COUNT] = max(clock[which, D_COUNT] - 2, 1)
+        elif clock[which, D_COUNT] >= par.outvoted:
+            if which == 0:
+                give_way_upwards(core.P, z[2], climb)
+            else:
+                give_way_turning(core.P, z[2])
+            clock[which, D_COUNT] = 0
         return
     age = (now - clock[1 - which, D_TIME]) * 1e-9
     east_apart, north_apart = _apart_by_yaw(core, par, doubt[1, 2])
@@ -90,33 +96,21 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     east -= other[0] + age * other[6] + sign * east_apart
     north -= other[1] + age * other[7] + sign * north_apart
     ee, en, nn = mine[3] + other[3], mine[4] + other[4], mine[5] + other[5]
+    sharp = ee + nn <= VAGUE_VAR
+    far = FAR_SHARE * max(math.hypot(other[0], other[1]) - FAR_M, 0.0)
+    ee += far * far
+    nn += far * far
     distance = (nn * east * east - 2.0 * en * east * north + ee * north * north) / (ee * nn - en * en)
-    agree = distance <= AGREEING and ee + nn <= VAGUE_VAR
+    agree = distance <= AGREEING and sharp
     clock[0, D_AGREED] = max(clock[0, D_AGREED] + (1 if agree else -2), 0)
     if clock[0, D_AGREED] >= par.outvoted:
-        _give_way(core.P, doubt)
+        if now - clock[1, D_GAVE] <= AGAIN_NS:
+            start_again(core, par, now)
+        else:
+            give_way(core.P, doubt)
+        clock[1, D_GAVE] = now
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
         clock[1, D_STREAK] = 0
-
-
-@kernel()
-def _doubt_all(P: Floats) -> None:
-    """Widen what a wrong state has been taken in by: tilt, biases, the wheel's scale."""
-    for i in range(3):
-        P[6 + i, 6 + i] += ATTITUDE_VAR
-        P[9 + i, 9 + i] += GYRO_BIAS_VAR
-        P[12 + i, 12 + i] += ACCEL_BIAS_VAR
-    P[E_WHEEL_SCALE, E_WHEEL_SCALE] += WHEEL_SCALE_VAR
-
-
-@kernel()
-def _forget(P: Floats, seconds: float) -> None:
-    """Widen position, velocity and attitude for the time that GNSS alone has contradicted them."""
-    grown = 2.0 ** (seconds / ALONE_DOUBLING_S)
-    for i in range(9):
-        for j in range(P.shape[0]):
-            P[i, j] *= grown
-            P[j, i] *= grown
 
 
 @kernel()
@@ -129,13 +123,24 @@ def _apart_by_yaw(core: Core, par: Parameters, yaw: float) -> Pair:
 
 
 @kernel()
-def _give_way(P: Floats, doubt: Floats) -> None:
-    """Widen P to what both sensors say."""
-    place = doubt[1, 0] * doubt[1, 0] + doubt[1, 1] * doubt[1, 1]
-    P[0, 0] += place
-    P[1, 1] += place
-    P[2, 2] += doubt[0, 2] * doubt[0, 2]
-    for i in range(3):
-        P[3 + i, 3 + i] += VELOCITY_VAR
-    _doubt_all(P)
-    P[8, 8] += doubt[1, 2] * doubt[1, 2]
+def _fits_but_for_height(core: Core, par: Parameters, z: Vector) -> bool:
+    """Whether a rejected GNSS position would pass the gate without its height: nothing else says anything of that."""
+    P, R = core.P, core.R
+    ee, en, nn = P[0, 0] + R[0, 0], P[0, 1] + R[0, 1], P[1, 1] + R[1, 1]
+    distance = (nn * z[0] * z[0] - 2.0 * en * z[0] * z[1] + ee * z[1] * z[1]) / (ee * nn - en * en)
+    fits: bool = distance <= par.gate[1]
+    return fits
+
+
+@kernel()
+def _fits_but_for_yaw(core: Core, par: Parameters, z: Vector) -> bool:
+    """Whether a rejected pose fix would pass the gate without its yaw, and the course of the state, which GNSS holds
+    by then, is on its side: a map's alias turns nothing that moves."""
+    nav, P, R = core.nav, core.P, core.R
+    speed = math.hypot(nav[3], nav[4])
+    r = attitude(nav)
+    course = math.atan2(nav[4], nav[3]) - math.atan2(r[3], r[0])
+    var = P[0, 0] + P[1, 1] + R[0, 0] + R[1, 1]
+    fits = z[0] * z[0] + z[1] * z[1] <= par.gate[1] * var and speed >= COURSE_SPEED
+    turned: bool = abs(wrap(course - z[2])) <= COURSE_NEAR and abs(wrap(course)) > COURSE_NEAR
+    return fits and turned

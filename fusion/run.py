@@ -40,14 +40,14 @@ class Session:
         Raises EgolocError for pose fixes without a map frame and for IMU stamps that do not rise.
         """
         navigator = self._navigator
-        before = navigator.last_imu_ns if self._samples else None
+        before, spikes = navigator.last_imu_ns if self._samples else None, navigator.spikes.held_back
         navigator.add(piece)
         self._samples += 0 if piece.imu is None else len(piece.imu)
         if not self._samples:
             navigator.decide(Reason.BEFORE_ALIGNMENT, _last_stamp(piece) - _START_NS)
         else:
             navigator.advance(navigator.last_imu_ns - self._held_ns)
-        return self._result(self._gaps(piece, before))
+        return self._result((*self._gaps(piece, before), *_spikes(navigator.spikes.held_back - spikes)))
 
     def finish(self) -> FusionResult:
         """The rest of the drive. Raises EgolocError if it had no IMU."""
@@ -93,6 +93,10 @@ def joined(results: list[FusionResult]) -> FusionResult:
         summed(entry for result in results for entry in result.left_out),
         tuple(restart for result in results for restart in result.restarts),
     )
+
+
+def _spikes(count: int) -> tuple[LeftOut, ...]:
+    return (LeftOut("imu", "spike, far from the samples before and after", count),) if count else ()
 
 
 def _last_stamp(piece: Log) -> int:

@@ -63,6 +63,8 @@ G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8
 
 # entries of Core.doubt_clock
 D_COUNT, D_TIME, D_AGREED, D_BELIEVED, D_SINCE, D_STREAK, D_LAST, D_TRACKING, D_HELD = range(9)
+D_GAVE = D_AGREED
+"""In the second row: when the state gave way last, ns."""
 
 # entries of Core.health: Health and Cause; when the core was aligned, a position was applied, one was explained, the
 # filter came back, the yaw was last known worse than linear; positions not explained since, the first and the last of

@@ -99,6 +99,7 @@ def _manifest(sources: Sequence[LogSource], job: Job) -> dict[str, Any]:
         "keep": msgspec.to_builtins(job.keep),
         "config_sha256": hashlib.sha256(to_toml(job.config).encode()).hexdigest(),
         "versions": versions(),
+        "inject": list(job.config.inject),
         "seed": job.config.seed,
         "command": list(job.command),
     }

@@ -1,7 +1,7 @@
 """The whole configuration of a replay: read from TOML, written complete into the run folder."""
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,8 +60,10 @@ class RunConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limits: Limits = Limits()
     """In TOML a table or a profile: paper, highway, local-street."""
     hide_gnss: HideGnss | None = None
+    inject: tuple[str, ...] = ()
+    """Faults put into every log: NAME[:SEVERITY][@BEGIN[+LENGTH]], s since the first IMU sample (docs/faults.md)."""
     seed: int = 0
-    """For what is random (nothing in a plain replay)."""
+    """For what is random in injected faults (nothing in a plain replay)."""
 
 
 def load_config(path: Path) -> RunConfig:
@@ -102,6 +104,19 @@ def check_hide_gnss(hide: HideGnss, where: str) -> HideGnss:
     if hide.length_s < SHORTEST_STRETCH_S:
         raise EgolocError(f"{where}: expected a LENGTH of at least {SHORTEST_STRETCH_S:g} s, got {hide.length_s:g}")
     return hide
+
+
+def with_faults(config: RunConfig, specs: Sequence[str], where: str = "--inject") -> RunConfig:
+    """The config with these faults, everything about them said. Raises EgolocError where they cannot be put in."""
+    from sensors.simulate.faults.spec import parse
+
+    injections = parse(specs, where)
+    for one in injections:
+        if config.hide_gnss is not None and any(record.startswith("gnss") for record in one.fault.acts):
+            raise EgolocError(
+                f"{where}: {one.fault.name}: expected no fault of GNSS with --hide-gnss: it is the reference"
+            )
+    return msgspec.structs.replace(config, inject=tuple(one.spec for one in injections))
 
 
 def to_toml(config: msgspec.Struct) -> str:
@@ -149,6 +164,7 @@ def _convert(raw: dict[str, Any], kind: type[S], path: Path) -> S:
         raise EgolocError(f"{path}: {_explain(str(error), kind, raw)}") from None
     if isinstance(result, RunConfig):
         _check_run(result, path)
+        return with_faults(result, result.inject, f"{path}: inject")  # type: ignore[return-value]
     return result
 
 

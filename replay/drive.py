@@ -20,15 +20,17 @@ from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame, utm_frame
 from sensors.records import LeftOut, Log, Trajectory
+from sensors.simulate.faults.spec import Injection
 
 
 class Drive:
     """Pieces in, batches of rows out.
 
     first: the first piece, which tells vehicle and map frame where the config does not; where: how messages about the
-    drive begin; reference_file: a trajectory instead of the drive's reference. config: with the vehicle and the map
-    frame in use (a drive without one takes the UTM frame of its first fix, unless it holds map coordinates); km: how
-    far the filter has driven; all_columns: of decisions, not only those that scoring reads.
+    drive begin; reference_file: a trajectory instead of the drive's reference; faults: what was put into the pieces;
+    all_columns: of decisions, not only those that scoring reads. config: with the vehicle and the map frame in use (a
+    drive without one takes the UTM frame of its first fix, unless it holds map coordinates); km: how far the filter has
+    driven.
     """
 
     def __init__(
@@ -37,6 +39,7 @@ class Drive:
         config: RunConfig,
         where: str,
         reference_file: Path | None = None,
+        faults: Sequence[Injection] = (),
         *,
         all_columns: bool = True,
     ) -> None:
@@ -47,7 +50,7 @@ class Drive:
         self._source = "log" if reference_file is None else reference_file.name
         self.config = msgspec.structs.replace(config, vehicle=vehicle, map_frame=frame)
         self.period_ns, self.km = round(NS_PER_S / config.fusion.output_hz), 0.0
-        self._vehicle, self._where = vehicle, where
+        self._vehicle, self._where, self._faults = vehicle, where, faults
         with self._named():
             self._session = Session(vehicle, frame, config.fusion)
             self._evaluation = Evaluation(vehicle, config, self._trajectory, all_columns=all_columns)
@@ -92,7 +95,7 @@ class Drive:
             "hide_gnss": None if hide is None else msgspec.to_builtins(hide),
             "stretches": self._evaluation.stretches,
             "health": self._watch.health.counts(self._evaluation.epochs()),
-            "warnings": self._watch.findings(start_ns),
+            "warnings": [*injected(self._faults), *self._watch.findings(start_ns)],
             "left_out": [
                 {"source": entry.source, "reason": entry.reason, "count": entry.count}
                 for entry in (*_entries(self._left_out), *_entries(self._noted))
@@ -124,6 +127,13 @@ class Drive:
                 yield
         except EgolocError as error:
             raise EgolocError(f"{self._where}: {error}") from None
+
+
+def injected(faults: Sequence[Injection]) -> Iterator[dict[str, str]]:
+    """A warning for each fault that was put in: what comes of it is no measure of the drive."""
+    for one in faults:
+        span = f"from {one.begin_s:g} s on for {one.length_s:g} s"
+        yield {"kind": "injected", "text": f"Fault injected, {span}: {one.fault.name}: {one.told}."}
 
 
 def read_reference(path: Path, frame: MapFrame | None) -> tuple[Trajectory, MapFrame | None]:

@@ -21,6 +21,8 @@ from replay.tables import Tables, stored_batches
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
 from sensors.records import Log
+from sensors.simulate.faults.inject import Injector
+from sensors.simulate.faults.spec import parse as parse_faults
 
 if TYPE_CHECKING:
     from replay.sums import Sums
@@ -63,6 +65,7 @@ def replay_source(
                 "keep": msgspec.to_builtins(keep),
                 "config_sha256": hashlib.sha256(to_toml(drive.config).encode()).hexdigest(),
                 "versions": versions(),
+                "inject": list(config.inject),
                 "seed": config.seed,
                 "command": list(command),
                 "facts": drive.facts(),
@@ -78,9 +81,10 @@ def _stream(
     source: LogSource, config: RunConfig, reference_file: Path | None, tables: Tables, progress: Progress | None
 ) -> tuple[Drive, "Sums"]:
     """Every piece through the filter into the tables; the drive at its end, and its sums."""
-    pieces = _pieces(source, config)
+    injector = Injector(parse_faults(config.inject), config.seed, f"{source.where}: --inject")
+    pieces = injector.pieces(_pieces(source, config))
     first = next(pieces, Log())
-    drive = Drive(first, config, source.where, reference_file, all_columns=tables.holds_decisions)
+    drive = Drive(first, config, source.where, reference_file, injector.injections, all_columns=tables.holds_decisions)
     scorer: Scorer | None = None
     for piece in chain((first,), pieces, (None,)):
         batch = drive.finish() if piece is None else drive.push(piece)

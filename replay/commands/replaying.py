@@ -51,6 +51,9 @@ class Replay:
         Literal["stamp", "arrival"] | None, tyro.conf.arg(help_behavior_hint="(default: the config's, else stamp)")
     ] = None
     """Measurements by when they were true, or as they came: late ones by rewinding, states as they were known then."""
+    inject: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
+    """Make sensors fail, as in gnss-jump:severe@60+20: NAME[:mild|medium|severe][@BEGIN[+LENGTH]] in s since the first
+    IMU sample; several with commas or --inject again. Names: docs/faults.md, or any other word."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
     """Logs replayed at a time, each in a process of its own."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")] = None
@@ -92,7 +95,7 @@ class Replay:
             raise EgolocError("--resume and --overwrite: expected one of them")
 
     def _settings(self) -> "RunConfig":
-        from replay.config import RunConfig, load_config, named_limits, parse_hide_gnss
+        from replay.config import RunConfig, load_config, named_limits, parse_hide_gnss, with_faults
 
         config = RunConfig() if self.config is None else load_config(self.config)
         if self.limits is not None:
@@ -104,7 +107,7 @@ class Replay:
             config = msgspec.structs.replace(config, hide_gnss=parse_hide_gnss(self.hide_gnss))
         if self.reference is not None and config.hide_gnss is not None:
             raise EgolocError("--hide-gnss scores against the hidden fixes: leave out --reference")
-        return config
+        return with_faults(config, self.inject or config.inject)
 
     def _keep(self) -> Any:
         from replay.store import Keep

@@ -7,7 +7,7 @@ Heading: GPSFix ``dip`` (deg clockwise from north; the third of its device angle
 Altitude is taken as height above the ellipsoid.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,20 @@ from sensors.records import (
     PoseFix,
     Trajectory,
     WheelSpeed,
-    positive_definite,
     sound_modes,
 )
 from sensors.rotation import wrap, yaw_from_q
+from sensors.sanity import (
+    MAX_ALTITUDE,
+    MAX_COORDINATE,
+    MAX_FORCE,
+    MAX_RATE,
+    MAX_SPEED,
+    covariance_valid,
+    finite_rows,
+    rows_within,
+    sane,
+)
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -49,11 +59,6 @@ DEFAULT_VELOCITY_SIGMA = (0.1, 0.2)
 """Horizontal and vertical, m/s, where a GPSFix gives none."""
 _FIXED_SIGMA = 0.05
 _STATUS = {-1: 0, 0: 1, 1: 2, 2: 3, 18: 2, 19: 4, 20: 3, 33: 2}
-_MAX_VARIANCE = 1e12
-MAX_RATE, MAX_FORCE, MAX_SPEED = 100.0, 1000.0, 1000.0
-"""Beyond these no vehicle moves: rad/s, m/s^2 (100 g) and m/s. One such sample would throw the filter off for good."""
-MAX_ALTITUDE, MAX_COORDINATE = 1e5, 2e7
-"""Of a fix and of a point on a map, m."""
 MAX_LATITUDE = 89.99
 """Nearer the pole there is hardly an east, deg."""
 
@@ -62,8 +67,8 @@ def decode_imu(topic: Topic) -> Decoded:
     """sensor_msgs/Imu; a first covariance element of -1 marks a quantity that is not measured."""
     gyro, accel = topic.column("gyro"), topic.column("accel")
     valid = {
-        **_sane("angular_velocity", gyro, MAX_RATE, "rad/s"),
-        **_sane("linear_acceleration", accel, MAX_FORCE, "m/s^2"),
+        **sane("angular_velocity", gyro, MAX_RATE, "rad/s"),
+        **sane("linear_acceleration", accel, MAX_FORCE, "m/s^2"),
         "angular_velocity is marked as not measured (covariance -1)": topic.column("gyro_known") != -1,
         "linear_acceleration is marked as not measured (covariance -1)": topic.column("accel_known") != -1,
     }
@@ -82,11 +87,11 @@ def decode_gnss(topic: Topic) -> Decoded:
     status[(raw == 2) & known & (claimed > 0) & (claimed <= _FIXED_SIGMA**2)] = GnssStatus.FIXED
     cov = np.where(known[:, None, None], given, _default_covariance(topic, status))
     valid = {
-        "latitude, longitude or altitude is not finite": _finite(degrees),
-        "latitude or longitude is out of range": _inside(degrees[:, :2], (MAX_LATITUDE, 360.0)),
+        "latitude, longitude or altitude is not finite": finite_rows(degrees),
+        "latitude or longitude is out of range": rows_within(degrees[:, :2], (MAX_LATITUDE, 360.0)),
         "latitude and longitude are both zero": (degrees[:, 0] != 0.0) | (degrees[:, 1] != 0.0),
-        f"altitude is beyond {MAX_ALTITUDE:g} m": _inside(degrees[:, 2:], (MAX_ALTITUDE,)),
-        **_covariance_valid("position_covariance", cov),
+        f"altitude is beyond {MAX_ALTITUDE:g} m": rows_within(degrees[:, 2:], (MAX_ALTITUDE,)),
+        **covariance_valid("position_covariance", cov),
     }
     llh = np.column_stack((np.radians(degrees[:, :2]), degrees[:, 2]))
     columns = {"llh": llh, "cov_enu": cov, "status": status}
@@ -109,7 +114,7 @@ def _default_covariance(topic: Topic, status: NDArray[np.int8]) -> Floats:
 
 def _yaw(heading: Floats) -> tuple[Floats, Floats]:
     """Yaw and its sigma, rad, from heading and 95 % error, deg; NaN where the error is not positive."""
-    given = _finite(heading) & (heading[:, 1] > 0)
+    given = finite_rows(heading) & (heading[:, 1] > 0)
     yaw = np.where(given, wrap(np.pi / 2 - np.radians(np.where(given, heading[:, 0], 0.0))), np.nan)
     return yaw, np.where(given, np.radians(np.where(given, heading[:, 1], 0.0)) / SIGMA_95, np.nan)
 
@@ -119,7 +124,7 @@ def decode_gnss_velocity(topic: Topic) -> Decoded | None:
     if topic.has_column("motion"):
         return _decode_motion(topic)
     vel, cov = topic.column("vel"), topic.column("cov").reshape(-1, 3, 3)
-    valid = _sane("twist.linear", vel, MAX_SPEED, "m/s") | _covariance_valid("twist.covariance", cov)
+    valid = sane("twist.linear", vel, MAX_SPEED, "m/s") | covariance_valid("twist.covariance", cov)
     return build(GnssVelocity, topic, {"vel_enu": vel, "cov_enu": cov}, valid)
 
 
@@ -146,8 +151,8 @@ def _decode_motion(topic: Topic) -> Decoded | None:
     vel = np.column_stack((speed * sine, speed * cosine, climb))
     valid = {
         "speed, track or climb is not finite": finite,
-        f"speed or climb is beyond {MAX_SPEED:g} m/s": _inside(vel, (MAX_SPEED,) * 3),
-        **_covariance_valid("err_speed or err_climb", cov),
+        f"speed or climb is beyond {MAX_SPEED:g} m/s": rows_within(vel, (MAX_SPEED,) * 3),
+        **covariance_valid("err_speed or err_climb", cov),
     }
     return build(GnssVelocity, topic, {"vel_enu": vel, "cov_enu": cov}, valid)
 
@@ -157,9 +162,9 @@ def decode_pose_fixes(topic: Topic) -> Decoded:
     p, cov = topic.column("p"), topic.column("cov").reshape(-1, 3, 3)
     q, rotates = _unit(topic.column("q"))
     valid = {
-        **_sane("pose.position", p[:, :2], MAX_COORDINATE, "m"),
+        **sane("pose.position", p[:, :2], MAX_COORDINATE, "m"),
         "pose.orientation is not a unit quaternion": rotates,
-        **_covariance_valid("pose.covariance of x, y, yaw", cov),
+        **covariance_valid("pose.covariance of x, y, yaw", cov),
     }
     pose = np.column_stack((p[:, :2], yaw_from_q(q)))
     return build(PoseFix, topic, {"pose": pose, "cov": cov}, valid)
@@ -171,7 +176,7 @@ def decode_pose_modes(topic: Topic) -> Decoded:
     given = weights[:, :, None] != 0.0
     used = np.where(given, modes, np.nan)
     valid = {
-        **_sane("modes", np.where(given, modes[:, :, :2], 0.0).reshape(-1, 4), MAX_COORDINATE, "m"),
+        **sane("modes", np.where(given, modes[:, :, :2], 0.0).reshape(-1, 4), MAX_COORDINATE, "m"),
         "weights are no falling masses of modes": sound_modes(used, weights),
     }
     used[:, :, 2] = wrap(used[:, :, 2])
@@ -182,7 +187,7 @@ def decode_wheel(topic: Topic) -> Decoded:
     """TwistWithCovarianceStamped in body axes: linear.x and its variance."""
     speed, variance = topic.column("speed"), topic.column("variance")
     measured = np.isfinite(variance) & (variance > 0)
-    valid = _sane("twist.linear.x", speed[:, None], MAX_SPEED, "m/s")
+    valid = sane("twist.linear.x", speed[:, None], MAX_SPEED, "m/s")
     valid["twist.covariance[0] is not positive"] = measured
     sigma = np.sqrt(np.where(measured, variance, 1.0))
     return build(WheelSpeed, topic, {"speed": speed, "sigma": sigma}, valid)
@@ -203,7 +208,7 @@ def decode_reference(topic: Topic) -> Decoded:
     for k, chosen in enumerate((np.where(np.minimum(x, y) >= 0, np.maximum(x, y), -1.0), yaw)):
         known = filled_in & np.isfinite(chosen) & (chosen >= 0)
         sigma[:, k] = np.sqrt(np.where(known, chosen, np.nan))
-    valid = _sane("pose.position", p, MAX_COORDINATE, "m")
+    valid = sane("pose.position", p, MAX_COORDINATE, "m")
     return build(Trajectory, topic, {"p_map": p, "q_map_body": q, "sigma": sigma}, valid, late=False)
 
 
@@ -218,42 +223,6 @@ DECODERS: Mapping[str, Callable[[Topic], Decoded | None]] = {
     "scene": decode_tags,
     "mode": decode_tags,
 }
-
-
-def _finite(values: Floats) -> Mask:
-    """(N,) rows of (N, k) that are all finite; column by column, for reducing short rows is slow."""
-    result = np.ones(len(values), bool)
-    for column in values.T:
-        result &= np.isfinite(column)
-    return result
-
-
-def _inside(values: Floats, largest: Sequence[float]) -> Mask:
-    """(N,) rows of (N, k) whose magnitudes are finite and at most the largest of their columns."""
-    result = np.ones(len(values), bool)
-    for column, bound in zip(values.T, largest, strict=True):
-        result &= np.abs(column) <= bound
-    return result
-
-
-def _sane(label: str, values: Floats, largest: float, unit: str) -> dict[str, Mask]:
-    """Reasons why rows of (N, k) quantities cannot be used."""
-    inside = _inside(values, (largest,) * values.shape[1])
-    finite = inside if inside.all() else _finite(values)
-    return {f"{label} is not finite": finite, f"{label} is beyond {largest:g} {unit}": inside}
-
-
-def _covariance_valid(label: str, cov: Floats) -> dict[str, Mask]:
-    """Reasons why (N, 3, 3) covariances cannot be used."""
-    finite = _finite(cov.reshape(-1, 9))
-    small = np.abs(np.where(np.isfinite(cov), cov, 0.0)).max(axis=(1, 2), initial=0.0) <= _MAX_VARIANCE
-    definite = positive_definite(np.where((finite & small)[:, None, None], cov, 0.0))
-    filled_in: Mask = np.any(cov != 0.0, axis=(1, 2))
-    return {
-        f"{label} is not finite": finite,
-        f"{label} is all zero": filled_in,
-        f"{label} is not positive definite": definite,
-    }
 
 
 def _unit(q: Floats) -> tuple[Floats, Mask]:
