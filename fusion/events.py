@@ -43,6 +43,7 @@ class Parameters(NamedTuple):
     still_ratio: float
     still_accel_var: float
     still_rate_var: float
+    still_drift_var: float
     still_max_speed: float
     zero_velocity_var: float
     zero_rate_var: float

@@ -31,15 +31,18 @@ def clear(a: Floats) -> None:
 @kernel()
 def shaking(
     ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, recent: Floats, window_ns: int, now: int
-) -> tuple[bool, float, float]:
-    """Whether samples fill the window before now; variances of |specific force| (m/s^2)^2 and yaw rate (rad/s)^2.
+) -> tuple[bool, float, float, float]:
+    """Whether samples fill the window before now; variances of |specific force| (m/s^2)^2 and yaw rate (rad/s)^2; and
+    by how much the horizontal force of its last quarter differs from that of the rest, squared.
 
-    recent (3,): becomes the mean rate since the last motion tick, rad/s.
+    A smooth start changes the norm by next to nothing: gravity hides it. recent (3,): becomes the mean rate since the
+    last motion tick, rad/s.
     """
     count = clock[C_COUNT]
     recent[0] = recent[1] = recent[2] = 0.0
     norm, norm2, turn, turn2 = 0.0, 0.0, 0.0, 0.0
-    n, fresh = 0, 0
+    ahead, left, late_ahead, late_left = 0.0, 0.0, 0.0, 0.0
+    n, fresh, late = 0, 0, 0
     oldest = now
     for back in range(min(count, RING_SIZE)):
         i = (count - 1 - back) % RING_SIZE
@@ -58,11 +61,18 @@ def shaking(
         f2 = ring[i, 3] ** 2 + ring[i, 4] ** 2 + ring[i, 5] ** 2
         norm += np.sqrt(f2)
         norm2 += f2
-    if n < 5 or fresh == 0 or now - oldest < 0.8 * window_ns:
-        return False, 0.0, 0.0
+        ahead += ring[i, 3]
+        left += ring[i, 4]
+        if t > now - window_ns // 4:
+            late, late_ahead, late_left = n, ahead, left
+    if n < 5 or fresh == 0 or late in (0, n) or now - oldest < 0.8 * window_ns:
+        return False, 0.0, 0.0, 0.0
     for k in range(3):
         recent[k] /= fresh
-    return True, norm2 / n - (norm / n) ** 2, turn2 / n - (turn / n) ** 2
+    early = n - late
+    drift_x = late_ahead / late - (ahead - late_ahead) / early
+    drift_y = late_left / late - (left - late_left) / early
+    return True, norm2 / n - (norm / n) ** 2, turn2 / n - (turn / n) ** 2, drift_x**2 + drift_y**2
 
 
 @kernel()
@@ -90,8 +100,8 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     speed = np.sqrt(nav[3] ** 2 + nav[4] ** 2 + nav[5] ** 2)
     quiet = False
     if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4]):
-        full, force, turn = shaking(core.ring, core.ring_t, core.clock, nav, residual, par.still_window_ns, now)
-        quiet = full and still(core.quietest, par, force, turn)
+        full, force, turn, drift = shaking(core.ring, core.ring_t, core.clock, nav, residual, par.still_window_ns, now)
+        quiet = full and still(core.quietest, par, force, turn) and drift < par.still_drift_var
         if quiet:
             _zero_rate(core, par, (residual[0], residual[1], residual[2]))
     core.clock[C_TICK] = now

@@ -74,6 +74,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         still_ratio=motion.still_ratio,
         still_accel_var=motion.still_accel**2,
         still_rate_var=float(np.radians(motion.still_rate_deg) ** 2),
+        still_drift_var=motion.still_drift**2,
         still_max_speed=motion.still_max_speed,
         zero_velocity_var=motion.zero_velocity_sigma**2,
         zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2) + noise.gyro_psd * motion.rate_hz,
