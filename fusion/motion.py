@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fusion._linalg import Vector, attitude, matvec_t
+from fusion._linalg import Vector, attitude, matvec, matvec_t
 from fusion.events import Parameters
 from fusion.gating import correct, innovate, whiten
 from fusion.measurements import body_velocity
@@ -31,9 +31,9 @@ def clear(a: Floats) -> None:
 @kernel()
 def shaking(
     ring: Floats, ring_t: Nanoseconds, clock: Nanoseconds, nav: Floats, recent: Floats, window_ns: int, now: int
-) -> tuple[bool, float, float, float]:
-    """Whether samples fill the window before now; variances of |specific force| (m/s^2)^2 and yaw rate (rad/s)^2; and
-    by how much the horizontal force of its last quarter differs from that of the rest, squared.
+) -> tuple[bool, float, float, float, Vector]:
+    """Whether samples fill the window before now; variances of |specific force| (m/s^2)^2 and yaw rate (rad/s)^2; by
+    how much the horizontal force of its last quarter differs from that of the rest, squared; and that last force.
 
     A smooth start changes the norm by next to nothing: gravity hides it. recent (3,): becomes the mean rate since the
     last motion tick, rad/s.
@@ -41,7 +41,7 @@ def shaking(
     count = clock[C_COUNT]
     recent[0] = recent[1] = recent[2] = 0.0
     norm, norm2, turn, turn2 = 0.0, 0.0, 0.0, 0.0
-    ahead, left, late_ahead, late_left = 0.0, 0.0, 0.0, 0.0
+    ahead, left, up, late_ahead, late_left, late_up = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     n, fresh, late = 0, 0, 0
     oldest = now
     for back in range(min(count, RING_SIZE)):
@@ -63,16 +63,17 @@ def shaking(
         norm2 += f2
         ahead += ring[i, 3]
         left += ring[i, 4]
+        up += ring[i, 5]
         if t > now - window_ns // 4:
-            late, late_ahead, late_left = n, ahead, left
+            late, late_ahead, late_left, late_up = n, ahead, left, up
     if n < 5 or fresh == 0 or late in (0, n) or now - oldest < 0.8 * window_ns:
-        return False, 0.0, 0.0, 0.0
+        return False, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0)
     for k in range(3):
         recent[k] /= fresh
     early = n - late
-    drift_x = late_ahead / late - (ahead - late_ahead) / early
-    drift_y = late_left / late - (left - late_left) / early
-    return True, norm2 / n - (norm / n) ** 2, turn2 / n - (turn / n) ** 2, drift_x**2 + drift_y**2
+    force: Vector = (late_ahead / late, late_left / late, late_up / late)
+    drift = (force[0] - (ahead - late_ahead) / early) ** 2 + (force[1] - (left - late_left) / early) ** 2
+    return True, norm2 / n - (norm / n) ** 2, turn2 / n - (turn / n) ** 2, drift, force
 
 
 @kernel()
@@ -89,6 +90,28 @@ def still(quietest: Floats, par: Parameters, force_var: float, turn_var: float) 
     return bool(force_var < min(par.still_accel_var, ratio * quietest[0]))
 
 
+@kernel()
+def unaccelerated(core: Core, par: Parameters, force: Vector) -> bool:
+    """Whether a specific force (body, m/s^2) is gravity's alone, as far as tilt and accelerometer bias are known.
+
+    Even braking is as quiet as rest. The acceleration's error is -[f]x dtheta - R dba with f nearly upright.
+    """
+    nav, P = core.nav, core.P
+    r = attitude(nav)
+    east, north, up = matvec(r, (force[0] - nav[13], force[1] - nav[14], force[2] - nav[15]))
+    pulled, variance = 0.0, 0.0
+    for row, tilted, seen in ((0, 7, east), (1, 6, north)):
+        sign = up if row == 0 else -up
+        pulled += seen * seen
+        variance += up * up * P[tilted, tilted]
+        for j in range(3):
+            a = r[3 * row + j]
+            variance -= 2.0 * sign * a * P[tilted, 12 + j]
+            for k in range(3):
+                variance += a * r[3 * row + k] * P[12 + j, 12 + k]
+    return bool(np.sqrt(pulled) < np.sqrt(par.still_drift_var) + 3.0 * np.sqrt(max(variance, 0.0)))
+
+
 @kernel(inline="always")
 def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, int]:
     """Residual, H and R of what the motion allows: sensor and degrees of freedom, 0 for nothing.
@@ -100,8 +123,11 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     speed = np.sqrt(nav[3] ** 2 + nav[4] ** 2 + nav[5] ** 2)
     quiet = False
     if par.zero_velocity and speed < par.still_max_speed + 3.0 * np.sqrt(P[3, 3] + P[4, 4]):
-        full, force, turn, drift = shaking(core.ring, core.ring_t, core.clock, nav, residual, par.still_window_ns, now)
-        quiet = full and still(core.quietest, par, force, turn) and drift < par.still_drift_var
+        full, norm, turn, drift, force = shaking(
+            core.ring, core.ring_t, core.clock, nav, residual, par.still_window_ns, now
+        )
+        quiet = full and still(core.quietest, par, norm, turn) and drift < par.still_drift_var
+        quiet = quiet and unaccelerated(core, par, force)
         if quiet:
             _zero_rate(core, par, (residual[0], residual[1], residual[2]))
     core.clock[C_TICK] = now
