@@ -102,8 +102,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     still_rate_deg: NonNegative = 0.3
     """Largest standard deviation of the yaw rate at rest (idling shakes the other two), deg/s."""
     still_drift: Positive = 0.08
-    """Largest change of the horizontal specific force, last quarter of the window against the rest of it: a smooth start
-    hides behind gravity in the norm, m/s^2."""
+    """Largest change of the horizontal force at rest, last quarter of the window against the rest (a smooth start hides
+    from the norm), and largest acceleration, besides three sigmas of what is known of tilt and bias, m/s^2."""
     still_ratio: Positive = 4.0
     """And at most so many times the deviations of the quietest window so far: a queue creeps smoothly, -."""
     still_max_speed: NonNegative = 0.3

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.baselines import moved
+from fusion.baselines import enu_between, moved
 from fusion.config import FusionConfig
 from fusion.result import States
 from fusion.run import Session
@@ -19,8 +19,8 @@ from sensors.rotation import matrix_from_q, wrap, yaw_from_q
 
 Floats = NDArray[np.float64]
 
-GNSS = ("gnss", "gnss_velocity")
-FAR_NS = 2**62
+_BEFORE_NS = -(2**62)
+"""Before any stamp."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +41,7 @@ def ends(log: Log, plan: Plan, config: FusionConfig) -> Estimates:
     """The end of each of the plan's stretches."""
     session = Session(log.vehicle, log.map_frame, config)
     found: Estimates = {}
-    before = -FAR_NS
+    before = _BEFORE_NS
     for stretch in plan.stretches:
         session.push(between(log, before, stretch.start_ns))
         before = stretch.start_ns
@@ -79,7 +79,7 @@ def state_at(states: States, t_ns: int, point: Floats) -> Estimate:
     step = float(states.t_ns[i + 1] - states.t_ns[i]) / NS_PER_S
     w = float(t_ns - states.t_ns[i]) / NS_PER_S / step
     first, second = states.vel_enu[i], states.vel_enu[i + 1]
-    chord = enu_step(states, i)
+    chord = enu_between(states.llh[i], states.llh[i + 1])
     place = (3 - 2 * w) * w * w * chord + step * w * (1 - w) * ((1 - w) * first - w * second)
     yaws = yaw_from_q(states.q_enu_body[i : i + 2])
     R = matrix_from_q(states.q_enu_body[i if w < 0.5 else i + 1])
@@ -89,10 +89,3 @@ def state_at(states: States, t_ns: int, point: Floats) -> Estimate:
     J = np.hstack((np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]))[:2]
     yaw = float(wrap(yaws[0] + w * wrap(yaws[1] - yaws[0])))
     return Estimate(moved(states.llh[i], place + lever), J @ cov @ J.T, yaw, float(cov[5, 5]))
-
-
-def enu_step(states: States, i: int) -> Floats:
-    """(3,) ENU m from state i to the next one."""
-    from fusion.baselines import enu_between
-
-    return enu_between(states.llh[i], states.llh[i + 1])

@@ -5,7 +5,6 @@ at the first position, no gates. In a stretch keyframes follow every KEYFRAME_S,
 covariance at the end is ISAM2's marginal.
 """
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 

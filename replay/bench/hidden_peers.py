@@ -1,9 +1,9 @@
-"""What the other filters get of a log over hidden stretches: arrays, the same noise figures, lever arms and first state.
+"""What the other filters get of a log over hidden stretches: arrays, with the same noise, lever arms and first state.
 
 They begin as egoloc does: with its first state and the sigmas of that (its diagonal), and anew a second after every
-pause in the IMU. Positions and velocities have the covariances that egoloc uses (floors and inflation), the IMU the same
-white noise (datasheet times ``imu.noise_scale``); stamps are corrected by the vehicle's delays. Standstill is where
-egoloc found it with all sensors, so that no peer needs a detector of its own.
+pause in the IMU. Positions and velocities have the covariances that egoloc uses (floors and inflation), the IMU the
+same white noise (datasheet times ``imu.noise_scale``); stamps are corrected by the vehicle's delays. They are told
+where the vehicle stood, as egoloc found it with GNSS never hidden: better than any of them could find in a stretch.
 """
 
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class PeerLog:
     config: FusionConfig
 
     def first_state(self, t_ns: int) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-        """egoloc's state at or after t_ns: llh, velocity ENU, q_enu_body, biases of gyro and accelerometer, sigma (15,)."""
+        """egoloc's state at or after t_ns: llh, velocity ENU, q_enu_body, gyro and accelerometer bias, sigma (15,)."""
         i = int(np.searchsorted(self.states.t_ns, t_ns))
         s = self.states
         return s.llh[i], s.vel_enu[i], s.q_enu_body[i], s.gyro_bias[i], s.accel_bias[i], s.sigma[i]

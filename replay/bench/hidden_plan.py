@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 Window = tuple[float, float]
 
+REFERENCE, FIXES = "the reference", "the withheld fixes"
+"""What ends are judged by."""
 AFTER_S = 0.3
 """A filter is run so far past an end, to have states on both sides of it."""
 BASELINE_S = 1.0
@@ -41,7 +43,7 @@ course's sigma)."""
 class End:
     """Where the vehicle was at the end of a stretch.
 
-    t_ns; llh (3,) of the plan's point; cov (2, 2) east, north m^2; yaw from east rad and its sigma, NaN where not known.
+    t_ns; llh (3,) of the plan's point; cov (2, 2) east, north m^2; yaw from east and its sigma, rad, NaN where unknown.
     """
 
     t_ns: int
@@ -78,8 +80,14 @@ class Plan:
 def plan(log: Log, lengths_s: Sequence[float], every_s: float, windows: Sequence[Window]) -> Plan:
     """Stretches of each length that lie within one of the windows (s since the first position).
 
-    Raises EgolocError for a log without IMU or positions.
+    Raises EgolocError for a log without IMU or positions, and for lengths or an interval that make no stretch.
     """
+    for name, values in (("--lengths", lengths_s), ("--every", (every_s,))):
+        for value in values:
+            if not 0.1 <= value <= 86_400.0:
+                raise EgolocError(f"{name}: expected seconds from 0.1 to a day, got {value:g}")
+    if not lengths_s:
+        raise EgolocError("--lengths: expected at least one length in s, got none")
     if log.imu is None or len(log.imu) < 2:
         raise EgolocError("bench hidden: expected a log with an IMU")
     if log.gnss is None or not len(log.gnss):
@@ -116,7 +124,7 @@ def _has_headings(reference: Trajectory | None) -> bool:
 class _Reference:
     """A reference with headings."""
 
-    name = "the reference"
+    name = REFERENCE
     missing = "no reference at the end"
 
     def __init__(self, log: Log) -> None:
@@ -144,7 +152,7 @@ class _Reference:
 class _Fixes:
     """Positions of status fixed, and their course."""
 
-    name = "the withheld fixes"
+    name = FIXES
     missing = "no fixed position at the end"
 
     def __init__(self, gnss: GnssFix, t_ns: Nanoseconds) -> None:

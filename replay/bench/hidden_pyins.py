@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from fusion.timeline import grid
 from replay.bench.hidden_egoloc import Estimate, Estimates
-from replay.bench.hidden_peers import PeerLog, Values
-from replay.bench.hidden_plan import Plan
+from replay.bench.hidden_peers import PeerLog
+from replay.bench.hidden_plan import Plan, Stretch
 from sensors.clock import NS_PER_S
 from sensors.rotation import matrix_from_q
 
@@ -30,6 +30,7 @@ STEP_S = 1.0
 """Longest step of the covariance, as pyins recommends."""
 INS, GYRO, ACCEL = slice(0, 9), slice(9, 12), slice(12, 15)
 POSITION, VELOCITY, WHEEL, LAND = range(4)
+
 
 class State(NamedTuple):
     """After IMU sample k: lla (3,) deg, deg, m; velocity NED m/s; mat_nb (3, 3); P (15, 15) in pyins' internal errors;
@@ -58,7 +59,8 @@ class Pva:
     def __init__(self, lla: Floats, velocity: Floats, rph: Floats, rows: bool = False) -> None:
         self._columns = {"lat": lla, "VN": velocity, "roll": rph}
         self._rows = rows
-        self.lat, self.alt = (lla[[0]], lla[[2]]) if rows else (lla[0], lla[2])
+        self.lat: Any = lla[[0]] if rows else lla[0]
+        self.alt: Any = lla[[2]] if rows else lla[2]
         self.shape = (1, 9)
 
     def __len__(self) -> int:
@@ -77,33 +79,34 @@ def ends(drive: PeerLog, plan: Plan, kinds: Sequence[int]) -> Estimates:
     own = Filter(drive)
     last_ns = max(stretch.last_ns for stretch in plan.stretches)
     events = _events(drive, kinds, last_ns)
-    times = np.array([event.t_ns for event in events])
     found: Estimates = {}
-    begins = [int(t) for t in drive.begin_ns] + [last_ns + 1]
-    stretches = iter(plan.stretches)
-    stretch = next(stretches, None)
-    for begin, until in pairwise(begins):
-        state = own.start(begin)
-        now = begin
-        while stretch is not None and stretch.start_ns < until:
-            if stretch.start_ns >= begin:
-                state = own.run(state, events[slice(*np.searchsorted(times, (now, stretch.start_ns)))])
+    for begin, until in pairwise([*drive.begin_ns.tolist(), last_ns + 1]):
+        state, now = own.start(begin), begin
+        for stretch in plan.stretches:
+            if begin <= stretch.start_ns < until:
+                state = own.run(state, events.between(now, stretch.start_ns))
                 now = stretch.start_ns
-                aids = [e for e in events[slice(*np.searchsorted(times, (now, stretch.last_ns + 1)))] if e.kind >= WHEEL]
-                fork = state
-                for length, end in sorted(stretch.ends.items()):
-                    fork = own.run(fork, [e for e in aids if e.t_ns <= end.t_ns])
-                    aids = [e for e in aids if e.t_ns > end.t_ns]
-                    found[stretch.start_ns, length] = own.estimate(fork, end.t_ns, plan.point)
-            stretch = next(stretches, None)
+                found |= own.hidden(state, stretch, events, plan.point)
     return found
 
 
-def _events(drive: PeerLog, kinds: Sequence[int], last_ns: int) -> list[Event]:
-    """All measurements of these kinds up to a time, in order."""
+class _Events:
+    """Measurements in order."""
+
+    def __init__(self, events: list[Event]) -> None:
+        self._events = sorted(events)
+        self._t_ns = np.array([event.t_ns for event in self._events], np.int64)
+
+    def between(self, first_ns: int, end_ns: int) -> list[Event]:
+        """Those in [first, end)."""
+        return self._events[slice(*np.searchsorted(self._t_ns, (first_ns, end_ns)))]
+
+
+def _events(drive: PeerLog, kinds: Sequence[int], last_ns: int) -> _Events:
+    """All measurements of these kinds up to a time."""
     ticks = grid(int(drive.begin_ns[0]), last_ns, drive.config.motion.rate_hz)
     times = {POSITION: drive.positions.t_ns, VELOCITY: drive.velocities.t_ns, WHEEL: drive.wheel.t_ns, LAND: ticks}
-    return sorted(Event(int(t), kind, row) for kind in kinds for row, t in enumerate(times[kind]) if t <= last_ns)
+    return _Events([Event(int(t), kind, row) for kind in kinds for row, t in enumerate(times[kind]) if t <= last_ns])
 
 
 class Filter:
@@ -132,14 +135,14 @@ class Filter:
 
         llh, velocity, q, gyro_bias, accel_bias, sigma = self._drive.first_state(t_ns)
         k = int(np.searchsorted(self._t_ns, t_ns, side="right")) - 1
-        lla, mat_nb = np.degrees(llh[:2]).tolist() + [llh[2]], NED @ matrix_from_q(q) * FRD
+        lla, mat_nb = _degrees(llh), NED @ matrix_from_q(q) * FRD
         rph = transform.mat_to_rph(mat_nb)
-        internal = self._model.transform_to_internal(Pva(np.array(lla), NED @ velocity, rph, rows=True))[0]
+        internal = self._model.transform_to_internal(Pva(lla, NED @ velocity, rph, rows=True))[0]
         P = np.zeros((15, 15))
         sd = np.concatenate((sigma[[1, 0, 2]], sigma[[4, 3, 5]], np.degrees(sigma[6:9])))
         P[INS, INS] = internal @ np.diag(sd**2) @ internal.T
         P[GYRO, GYRO], P[ACCEL, ACCEL] = np.diag(sigma[9:12] ** 2), np.diag(sigma[12:15] ** 2)
-        return State(k, np.array(lla), NED @ velocity, mat_nb, P, gyro_bias * FRD, accel_bias * FRD)
+        return State(k, lla, NED @ velocity, mat_nb, P, gyro_bias * FRD, accel_bias * FRD)
 
     def run(self, state: State, events: Sequence[Event]) -> State:
         """Go through measurements in order; those at one time are applied together, to the sample at or before it."""
@@ -154,6 +157,16 @@ class Filter:
                 i += 1
             state = _corrected(state, x, P)
         return state
+
+    def hidden(self, state: State, stretch: Stretch, events: _Events, point: Floats) -> Estimates:
+        """The ends of a stretch, without GNSS."""
+        found: Estimates = {}
+        now = stretch.start_ns
+        for length, end in sorted(stretch.ends.items()):
+            state = self.run(state, [e for e in events.between(now, end.t_ns) if e.kind in (WHEEL, LAND)])
+            now = end.t_ns
+            found[stretch.start_ns, length] = self.estimate(state, now, point)
+        return found
 
     def advance(self, state: State, t_ns: int) -> State:
         """Go on to the last sample at or before t_ns."""
