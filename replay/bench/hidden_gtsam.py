@@ -1,7 +1,7 @@
 """gtsam over hidden stretches: ISAM2 over keyframes at every position, a copy of it at every start.
 
-ImuFactor and a random walk of the bias between keyframes, GPSFactorArm for positions; flat earth in the plane tangent
-at the first position, no gates. In a stretch keyframes follow every KEYFRAME_S, so that the bias may walk, and the
+ImuFactor and a random walk of the bias between keyframes, GPSFactorArm for positions, in the plane tangent at the first
+position with its gravity and the earth's rotation; no gates. In a stretch keyframes follow every KEYFRAME_S, so that the bias may walk, and the
 covariance at the end is ISAM2's marginal.
 """
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from replay.bench.hidden_egoloc import Estimate, Estimates
 from replay.bench.hidden_peers import PeerLog
 from replay.bench.hidden_plan import Plan, Stretch
+from sensors._kernels import EARTH_RATE, gravity_enu
 from sensors.clock import NS_PER_S
 from sensors.geodesy import enu_from_llh, llh_from_enu, rotation_ecef_enu
 from sensors.rotation import matrix_from_q
@@ -22,8 +23,6 @@ Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
 KEYFRAME_S = 1.0
-GRAVITY = 9.80665
-"""Where the drive's own is not asked for: the accelerometer bias of the first seconds takes the rest."""
 
 
 def ends(drive: PeerLog, plan: Plan) -> Estimates:
@@ -49,14 +48,14 @@ class Graph:
 
         self._drive, self._gtsam, self._keys = drive, gtsam, (X, V, B)
         self._datum = drive.positions.value[0]
-        self._t_ns, self._k, self._next = begin_ns, 0, int(np.searchsorted(drive.positions.t_ns, begin_ns))
+        self._t_ns, self._k, self._next = begin_ns, 0, int(np.searchsorted(drive.positions.t_ns, begin_ns, side="right"))
         self._antenna = enu_from_llh(drive.positions.value, self._datum)
         llh, velocity, q, gyro_bias, accel_bias, sigma = drive.first_state(begin_ns)
         R = self._plane(llh)
         pose = gtsam.Pose3(gtsam.Rot3(R @ matrix_from_q(q)), enu_from_llh(llh[None], self._datum)[0])
         self._state = gtsam.NavState(pose, R @ velocity)
         self._bias = gtsam.imuBias.ConstantBias(accel_bias, gyro_bias)
-        self._params = _imu_noise(gtsam, drive)
+        self._params = _imu_params(gtsam, drive, self._datum)
         how = gtsam.ISAM2Params()
         how.setFactorization("QR")  # Cholesky, the default, finds this graph indeterminate
         self._isam = gtsam.ISAM2(how)
@@ -160,8 +159,10 @@ def _steps(drive: PeerLog, first_ns: int, last_ns: int) -> tuple[Floats, Floats,
     return ((gyro[1:] + gyro[:-1]) / 2)[kept], ((accel[1:] + accel[:-1]) / 2)[kept], dt[kept]
 
 
-def _imu_noise(gtsam: Any, drive: PeerLog) -> Any:
-    params = gtsam.PreintegrationParams.MakeSharedU(GRAVITY)
+def _imu_params(gtsam: Any, drive: PeerLog, datum: Floats) -> Any:
+    sine, cosine = np.sin(datum[0]), np.cos(datum[0])
+    params = gtsam.PreintegrationParams.MakeSharedU(-gravity_enu(sine, cosine, datum[2])[1])
+    params.setOmegaCoriolis(EARTH_RATE * np.array([0.0, cosine, sine]))
     params.setAccelerometerCovariance(np.eye(3) * drive.noise.accel_psd)
     params.setGyroscopeCovariance(np.eye(3) * drive.noise.gyro_psd)
     params.setIntegrationCovariance(np.eye(3) * 1e-9)
