@@ -38,6 +38,8 @@ class Parameters(NamedTuple):
     lateral_var: float
     vertical_var: float
     per_speed: float
+    learning_ticks: int
+    unknown_var: float
     min_speed: float
     still_window_ns: int
     still_ratio: float

@@ -18,6 +18,12 @@ QUIETEST_FORCE = 0.003
 """No IMU rests quieter than this (a stuck one does), m/s^2."""
 QUIETEST_TURN = 1e-4
 """The same for the yaw rate, rad/s."""
+PLACED = 0.3
+"""Residuals of the non-holonomic update are learned from while the place is known so well, m: by GNSS or a map."""
+REMEMBERED = 60.0
+"""So many blocks of residuals are looked back on."""
+PRIOR_BLOCKS = 3.0
+"""What is thought of the rear axle at first counts as so many blocks."""
 
 
 @kernel()
@@ -112,6 +118,39 @@ def unaccelerated(core: Core, par: Parameters, force: Vector) -> bool:
     return bool(np.sqrt(pulled) < np.sqrt(par.still_drift_var) + 3.0 * np.sqrt(max(variance, 0.0)))
 
 
+@kernel()
+def learn(slipped: Floats, residual: Floats, ticks: int, placed: bool) -> None:
+    """Take a lateral and a vertical residual, m/s, into slipped (3, 2) while the place is known from elsewhere.
+
+    Rows: sums of the block of ticks that is going on; sums of squared means of blocks, the latest REMEMBERED of them;
+    ticks in the block, blocks. What is white averages out over a block; slip in curves, bumps and a mounting that is
+    off do not.
+    """
+    if not placed:
+        slipped[0, 0] = slipped[0, 1] = slipped[2, 0] = 0.0
+        return
+    slipped[0, 0] += residual[0]
+    slipped[0, 1] += residual[1]
+    slipped[2, 0] += 1.0
+    if slipped[2, 0] < ticks:
+        return
+    full = slipped[2, 1] >= REMEMBERED
+    for k in range(2):
+        if full:
+            slipped[1, k] *= 1.0 - 1.0 / REMEMBERED
+        slipped[1, k] += (slipped[0, k] / ticks) ** 2
+        slipped[0, k] = 0.0
+    slipped[2, 0] = 0.0
+    slipped[2, 1] = min(slipped[2, 1] + 1.0, REMEMBERED)
+
+
+@kernel()
+def learned(slipped: Floats, k: int, par: Parameters) -> float:
+    """Variance of one update that makes those of a block say as much as their mean does: ticks times its square."""
+    prior = PRIOR_BLOCKS * par.unknown_var
+    return float((prior + slipped[1, k] * par.learning_ticks) / (PRIOR_BLOCKS + slipped[2, 1]))
+
+
 @kernel(inline="always")
 def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, int]:
     """Residual, H and R of what the motion allows: sensor and degrees of freedom, 0 for nothing.
@@ -144,9 +183,13 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
     velocity = body_velocity(nav, attitude(nav), core.H, par.axle, rate)
     for j in range(E_WHEEL_SCALE):  # lateral and vertical rows first
         core.H[0, j], core.H[1, j], core.H[2, j] = core.H[1, j], core.H[2, j], 0.0
+    residual[0], residual[1] = -velocity[1], -velocity[2]
     extra = (par.per_speed * speed) ** 2
     R[0, 0], R[1, 1] = par.lateral_var + extra, par.vertical_var + extra
-    residual[0], residual[1] = -velocity[1], -velocity[2]
+    if par.learning_ticks > 0:
+        learn(core.slipped, residual, par.learning_ticks, P[0, 0] + P[1, 1] < PLACED**2)
+        for k in range(2):
+            R[k, k] = max(R[k, k], learned(core.slipped, k, par))
     return _NON_HOLONOMIC, 2
 
 

@@ -72,6 +72,7 @@ class Core(NamedTuple):
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (RING_SIZE, 6), ring_t (RING_SIZE,): latest IMU samples.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
+    slipped (3, 2): what the drive has shown of the rear axle's lateral and vertical velocity (``fusion.motion``).
     doubt (2, 8), doubt_clock (2, 3) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
     phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
@@ -87,6 +88,7 @@ class Core(NamedTuple):
     ring: Floats
     ring_t: Nanoseconds
     quietest: Floats
+    slipped: Floats
     doubt: Floats
     doubt_clock: Nanoseconds
     phi: Floats
@@ -114,6 +116,7 @@ def new_core() -> Core:
         ring=np.zeros((RING_SIZE, 6)),
         ring_t=np.zeros(RING_SIZE, np.int64),
         quietest=np.full(2, np.inf),
+        slipped=np.zeros((3, 2)),
         doubt=np.zeros((2, 8)),
         doubt_clock=np.zeros((2, 3), np.int64),
         phi=np.zeros((9, ROW)),

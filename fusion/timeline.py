@@ -69,6 +69,8 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         lateral_var=motion.lateral_sigma**2,
         vertical_var=motion.vertical_sigma**2,
         per_speed=motion.sigma_per_speed,
+        learning_ticks=round(motion.learning_s * motion.rate_hz),
+        unknown_var=motion.unknown_sigma**2,
         min_speed=motion.min_speed,
         still_window_ns=round(motion.still_window_s * 1e9),
         still_ratio=motion.still_ratio,

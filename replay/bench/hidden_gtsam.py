@@ -1,8 +1,8 @@
 """gtsam over hidden stretches: ISAM2 over keyframes at every position, a copy of it at every start.
 
 ImuFactor and a random walk of the bias between keyframes, GPSFactorArm for positions, in the plane tangent at the first
-position with its gravity and the earth's rotation; no gates. In a stretch keyframes follow every KEYFRAME_S, so that the bias may walk, and the
-covariance at the end is ISAM2's marginal.
+position with its gravity and the earth's rotation; no gates. In a stretch keyframes follow every KEYFRAME_S, so that
+the bias may walk, and the covariance at the end is ISAM2's marginal.
 """
 
 from itertools import pairwise
@@ -48,7 +48,11 @@ class Graph:
 
         self._drive, self._gtsam, self._keys = drive, gtsam, (X, V, B)
         self._datum = drive.positions.value[0]
-        self._t_ns, self._k, self._next = begin_ns, 0, int(np.searchsorted(drive.positions.t_ns, begin_ns, side="right"))
+        self._t_ns, self._k, self._next = (
+            begin_ns,
+            0,
+            int(np.searchsorted(drive.positions.t_ns, begin_ns, side="right")),
+        )
         self._antenna = enu_from_llh(drive.positions.value, self._datum)
         llh, velocity, q, gyro_bias, accel_bias, sigma = drive.first_state(begin_ns)
         R = self._plane(llh)
