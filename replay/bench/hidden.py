@@ -36,7 +36,8 @@ Facts = dict[str, Any]
 GRADES: tuple[PresetName, ...] = ("tactical", "automotive", "consumer")
 SEEDS = (101, 102, 103)
 """Of the simulated drives; other seeds are for tuning."""
-SIMULATED_S = 600.0
+SIMULATED_S, SIMULATED_HZ = 400.0, 5.0
+"""Length of a simulated drive and rate of its positions: the benchmark takes minutes, most of them pyins."""
 WARM_UP_S = 60.0
 """Stretches begin so long after the first position where no window is given."""
 PACKAGES = {"pyins": ("python-ins", "pandas"), "gtsam": ("gtsam",)}
@@ -99,9 +100,10 @@ def positions_only() -> FusionConfig:
 def grade_log(grade: PresetName, seed: int, seconds: float = SIMULATED_S) -> Log:
     """City drive with white GNSS errors, neither pose fixes nor wheel speed, and an IMU of a grade with its flaws."""
     scenario = load("clean")
+    gnss = msgspec.structs.replace(scenario.gnss, rate_hz=SIMULATED_HZ)
     without = {name: msgspec.structs.replace(getattr(scenario, name), use=False) for name in ("pose_fix", "wheel")}
     imu = msgspec.structs.replace(scenario.imu, preset=grade)
-    return simulate(seconds, seed, msgspec.structs.replace(scenario, imu=imu, **without))
+    return simulate(seconds, seed, msgspec.structs.replace(scenario, imu=imu, gnss=gnss, **without))
 
 
 def _installed(peers: Sequence[str] | None) -> list[str]:

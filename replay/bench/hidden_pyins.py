@@ -5,6 +5,7 @@ second per fix in pandas), made of pyins' own parts: increments, strapdown, erro
 correction. A test holds it to the original.
 """
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -87,29 +88,22 @@ def ends(drive: PeerLog, plan: Plan, kinds: Sequence[int]) -> Estimates:
         state, now = own.start(begin), begin
         for stretch in plan.stretches:
             if begin <= stretch.start_ns < until:
-                state = own.run(state, events.between(now, stretch.start_ns))
+                state = own.run(state, _between(events, now, stretch.start_ns))
                 now = stretch.start_ns
                 found |= own.hidden(state, stretch, events, plan.point)
     return found
 
 
-class _Events:
-    """Measurements in order."""
-
-    def __init__(self, events: list[Event]) -> None:
-        self._events = sorted(events)
-        self._t_ns = np.array([event.t_ns for event in self._events], np.int64)
-
-    def between(self, first_ns: int, end_ns: int) -> list[Event]:
-        """Those in [first, end)."""
-        return self._events[slice(*np.searchsorted(self._t_ns, (first_ns, end_ns)))]
-
-
-def _events(drive: PeerLog, kinds: Sequence[int], last_ns: int) -> _Events:
-    """All measurements of these kinds up to a time."""
+def _events(drive: PeerLog, kinds: Sequence[int], last_ns: int) -> list[Event]:
+    """All measurements of these kinds up to a time, in order."""
     ticks = grid(int(drive.begin_ns[0]), last_ns, drive.config.motion.rate_hz)
     times = {POSITION: drive.positions.t_ns, VELOCITY: drive.velocities.t_ns, WHEEL: drive.wheel.t_ns, LAND: ticks}
-    return _Events([Event(int(t), kind, row) for kind in kinds for row, t in enumerate(times[kind]) if t <= last_ns])
+    return sorted(Event(int(t), kind, row) for kind in kinds for row, t in enumerate(times[kind]) if t <= last_ns)
+
+
+def _between(events: list[Event], first_ns: int, end_ns: int) -> list[Event]:
+    """Those in [first, end)."""
+    return events[bisect_left(events, (first_ns,)) : bisect_left(events, (end_ns,))]
 
 
 class Filter:
@@ -161,12 +155,12 @@ class Filter:
             state = _corrected(state, x, P)
         return state
 
-    def hidden(self, state: State, stretch: Stretch, events: _Events, point: Floats) -> Estimates:
+    def hidden(self, state: State, stretch: Stretch, events: list[Event], point: Floats) -> Estimates:
         """The ends of a stretch, without GNSS."""
         found: Estimates = {}
         now = stretch.start_ns
         for length, end in sorted(stretch.ends.items()):
-            state = self.run(state, [e for e in events.between(now, end.t_ns) if e.kind in (WHEEL, LAND)])
+            state = self.run(state, [e for e in _between(events, now, end.t_ns) if e.kind in (WHEEL, LAND)])
             now = end.t_ns
             found[stretch.start_ns, length] = self.estimate(state, now, point)
         return found
