@@ -170,19 +170,25 @@ def ends_by(peer: str) -> Callable[[PeerLog, Plan], Estimates]:
     return lambda drive, planned: hidden_pyins.ends(drive, planned, (hidden_pyins.POSITION,))
 
 
-@pytest.mark.parametrize("peer", ["pyins", "gtsam"])
-def test_peers_are_right_on_an_easy_drive(peer: str, log: Log, planned: Plan, drive: PeerLog) -> None:
-    """Position only, an IMU that is as stated: each is as good as egoloc, and none is too sure of itself."""
+@pytest.mark.parametrize(("peer", "apart"), [("pyins", 0.15), ("gtsam", 0.8)])
+def test_peers_are_right_on_an_easy_drive(peer: str, apart: float, log: Log, planned: Plan, drive: PeerLog) -> None:
+    """Position only, an IMU that is as stated: each ends where egoloc does, in sigmas, and says so as surely.
+
+    gtsam smooths: what it thinks of the time before a stretch is not what a filter thought.
+    """
     few = plan_of(planned, slice(0, 5))
-    own = list(misses(few, hidden_egoloc.ends(log, few, hidden.positions_only())))
-    found = list(misses(few, ends_by(peer)(drive, few)))
-    assert len(found) == len(own) == 10
-    for length, size in ((5.0, 0.3), (15.0, 1.2)):
-        theirs, ours = (np.array([m.horizontal for m in x if m.length_s == length]) for x in (found, own))
-        assert np.median(theirs) == pytest.approx(np.median(ours), rel=0.3)
-        assert theirs.max() < size
-    assert rms([m.squared / 2.0 for m in found], squared=True) < 1.3
-    assert max(abs(m.yaw) for m in found) < np.radians(0.3)
+    own = hidden_egoloc.ends(log, few, hidden.positions_only())
+    found = ends_by(peer)(drive, few)
+    assert found.keys() == own.keys()
+    assert len(own) == 10
+    for key, ours in own.items():
+        sigma = np.sqrt(ours.cov.trace())
+        assert np.linalg.norm(enu_between(ours.llh, found[key].llh)[:2]) < apart * sigma
+        assert np.sqrt(found[key].cov.trace()) == pytest.approx(sigma, rel=0.03)
+        assert found[key].yaw == pytest.approx(ours.yaw, abs=2.0 * np.sqrt(ours.yaw_var))
+        assert found[key].yaw_var == pytest.approx(ours.yaw_var, rel=0.1)
+    missed = list(misses(few, found))
+    assert rms([m.squared / 2.0 for m in missed], squared=True) < 1.3
 
 
 @pytest.mark.slow
