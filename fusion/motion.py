@@ -49,9 +49,9 @@ def shaking(
     norm, norm2, turn, turn2 = 0.0, 0.0, 0.0, 0.0
     ahead, left, up, late_ahead, late_left, late_up = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     n, fresh, late = 0, 0, 0
-    oldest = now
+    oldest, quarter = now, now - window_ns // 4
     for back in range(min(count, RING_SIZE)):
-        i = (count - 1 - back) % RING_SIZE
+        i = (count - 1 - back) & (RING_SIZE - 1)  # a power of two
         t = ring_t[i]
         if t <= now - window_ns:
             break
@@ -70,7 +70,7 @@ def shaking(
         ahead += ring[i, 3]
         left += ring[i, 4]
         up += ring[i, 5]
-        if t > now - window_ns // 4:
+        if t > quarter:
             late, late_ahead, late_left, late_up = n, ahead, left, up
     if n < 5 or fresh == 0 or late in (0, n) or now - oldest < 0.8 * window_ns:
         return False, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0)
