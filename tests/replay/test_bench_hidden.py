@@ -29,6 +29,7 @@ from sensors.simulate.imu_presets import ImuFlaws
 from sensors.simulate.scenarios import load
 
 Floats = NDArray[np.float64]
+Captured = pytest.CaptureFixture[str]
 SECOND = 1_000_000_000
 
 
@@ -257,7 +258,7 @@ def test_pyins_here_is_its_own_feedback_filter(drive: PeerLog) -> None:
     assert np.abs(transform.mat_to_rph(found.mat_nb) - theirs[util.RPH_COLS].to_numpy()).max() < 1e-8
 
 
-def test_its_json_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_its_json_and_table(tmp_path: Path, capsys: Captured) -> None:
     write_log(tmp_path / "easy.mcap", easy(60.0))
     given = ["bench", "hidden", str(tmp_path / "easy.mcap"), "--lengths", "5", "--from", "20", "--halves", "--peers"]
     assert main([*given, "--json"]) == 0
@@ -287,9 +288,7 @@ def test_its_json_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         (["--from", "5000"], "expected at least one stretch within the windows and the log, found none"),
     ],
 )
-def test_mistakes_are_one_line(
-    given: list[str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line(given: list[str], expected: str, tmp_path: Path, capsys: Captured) -> None:
     write_log(tmp_path / "easy.mcap", easy(40.0))
     assert main(["bench", "hidden", str(tmp_path / "easy.mcap"), "--peers", *given]) == 2
     assert expected in capsys.readouterr().err
@@ -300,8 +299,3 @@ def test_logs_without_imu_or_positions_are_refused(log: Log) -> None:
         plan(replace(log, imu=None), (15.0,), 10.0, ((0.0, 100.0),))
     with pytest.raises(EgolocError, match="expected a log with GNSS positions"):
         plan(replace(log, gnss=None), (15.0,), 10.0, ((0.0, 100.0),))
-
-
-def test_other_benchmarks_take_no_log(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "mcap", "some.mcap"]) == 2
-    assert "bench mcap: expected no log, got some.mcap" in capsys.readouterr().err
