@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fusion._linalg import Vector, attitude, axpy, blend, matvec
 from fusion.covariance import accumulate, coast, propagate, widen
 from fusion.events import AGAIN, MOTION, Events, Measurements, Parameters, Recorder
+from fusion.layout import Layout
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.snapshots import S_CHANGED, save
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, Core, Floats
@@ -83,7 +84,7 @@ def sweep(
                     _coast(core, par, (stop - now) * 1e-9)
                 else:
                     part = (interval, (now - start) / whole, (stop - start) / whole, (stop - now) * 1e-9)
-                    _advance(nav, earth, acc, span, part, par.layout.gyro_scale)
+                    _advance(nav, earth, acc, span, part, par.layout)
                     if gap:
                         age(core, span[0])
                         propagate(nav, earth, core.P, acc, span, (core.phi, core.M, core.Mt), par.noise)
@@ -145,8 +146,8 @@ def _bend(older: Vector, last: Vector, new: Vector) -> Vector:
 
 
 @kernel(inline="always")
-def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part, gyro_scale: int) -> None:
-    """One strapdown step over a part of an IMU interval; gyro_scale: its error state."""
+def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part, layout: Layout) -> None:
+    """One strapdown step over a part of an IMU interval."""
     interval, a, b, dt = part
     w0, w1, f0, f1, w_bend, f_bend = interval
     bg: Vector = (nav[10], nav[11], nav[12])
@@ -163,8 +164,11 @@ def _advance(nav: Floats, earth: Floats, acc: Floats, span: Floats, part: Part, 
     r = attitude(nav)
     dv = matvec(r, axpy(bow, f_bend, push))
     turn = axpy(bow, w_bend, turn)
-    if gyro_scale >= 0:
-        turn = (turn[0], turn[1], turn[2] * (1.0 - nav[gyro_scale + 1]))
+    g, b = layout.gyro_scale + 1, layout.gyro_misalignment + 1
+    if g > 0:
+        turn = (turn[0], turn[1], turn[2] * (1.0 - nav[g]))
+    if b > 0:
+        turn = (turn[0] - nav[b] * turn[2], turn[1] - nav[b + 1] * turn[2], turn[2])
     accumulate(acc, span, r, dv, turn[2], dt)
     strapdown(nav, earth, turn, dv, dt)
 

@@ -127,12 +127,16 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Apply zero velocity and zero rate while the IMU shows that the vehicle stands."""
     rate_hz: RateHz = 10.0
     """How often these are applied, Hz."""
-    lateral_sigma: Positive = 0.1
-    """Lateral velocity of the rear axle, m/s."""
-    vertical_sigma: Positive = 0.2
-    """Vertical velocity of the rear axle, m/s."""
-    sigma_per_speed: NonNegative = 0.01
-    """Growth of both with speed (mounting angles known to half a degree), m/s per m/s."""
+    lateral_sigma: Positive = 0.05
+    """Lateral velocity of the rear axle at each update, at least, m/s."""
+    vertical_sigma: Positive = 0.1
+    """Vertical velocity of the rear axle at each update, at least, m/s."""
+    sigma_per_speed: NonNegative = 0.0
+    """Growth of both with speed, m/s per m/s."""
+    unknown_sigma: Positive = 0.3
+    """Both, before the drive has shown how the rear axle moves, m/s."""
+    learning_s: NonNegative = 4.0
+    """That is learned from means over so long while the place is known (slip lasts for a curve); 0: it is not, s."""
     min_speed: NonNegative = 2.0
     """Below this speed the non-holonomic update waits, m/s."""
     still_window_s: Positive = 1.0
@@ -143,6 +147,9 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Largest standard deviation of the acceleration's norm at rest, m/s^2."""
     still_rate_deg: NonNegative = 0.3
     """Largest standard deviation of the yaw rate at rest (idling shakes the other two), deg/s."""
+    still_drift: Positive = 0.08
+    """Largest change of the horizontal force at rest, last quarter of the window against the rest (a smooth start hides
+    from the norm), and largest acceleration, besides three sigmas of what is known of tilt and bias, m/s^2."""
     still_ratio: Positive = 4.0
     """And at most so many times the deviations of the quietest window so far: a queue creeps smoothly, -."""
     still_max_speed: NonNegative = 0.3

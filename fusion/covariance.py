@@ -31,6 +31,8 @@ class Noise(NamedTuple):
     """Growth of the wheel scale's variance, 1/s."""
     gyro_scale: int = -1
     """Where the gyro's scale stands in the error state (``fusion.layout``)."""
+    gyro_misalignment: int = -1
+    """The same of its misalignment."""
 
 
 @kernel()
@@ -40,9 +42,10 @@ def accumulate(acc: Floats, span: Floats, r: Matrix, dv: Vector, turned: float, 
     dtheta' = -R dbg, dv' = -[f]x dtheta - R dba, dp' = dv, each constant over the step. turned: about the body's
     vertical axis, rad.
     """
-    acc[A_T, 0] += r[2] * turned
-    acc[A_T, 1] += r[5] * turned
-    acc[A_T, 2] += r[8] * turned
+    for i in range(3):
+        acc[A_T + i, 0] += r[3 * i] * turned
+        acc[A_T + i, 1] += r[3 * i + 1] * turned
+        acc[A_T + i, 2] += r[3 * i + 2] * turned
     for j in range(3):
         a0, a1, a2 = r[j] * dt, r[3 + j] * dt, r[6 + j] * dt
         # attitude error in mid-step per gyro bias is -m; velocity changes by dv x m
@@ -121,13 +124,18 @@ def propagate(
     transition(nav, earth, acc, span, phi)
     size = P.shape[0]
     _product(phi, P, M)
-    g = noise.gyro_scale
+    g, b = noise.gyro_scale, noise.gyro_misalignment
     if size > ROW:
         _other_columns(phi, P, M)
-    if g >= 0:  # what it does to velocity within the span is left out: the attitude brings it over the next ones
+    # what these do to velocity within the span is left out: the attitude brings it over the next ones
+    if g >= 0:
         for i in range(3):
             for j in range(size):
-                M[6 + i, j] -= acc[A_T, i] * P[g, j]
+                M[6 + i, j] -= acc[A_T + i, 2] * P[g, j]
+    if b >= 0:
+        for i in range(3):
+            for j in range(size):
+                M[6 + i, j] -= acc[A_T + i, 0] * P[b, j] + acc[A_T + i, 1] * P[b + 1, j]
     for k in range(15):
         for i in range(9):
             Mt[k, i] = M[i, k]
@@ -138,7 +146,11 @@ def propagate(
     if g >= 0:
         for i in range(9):
             for j in range(3):
-                M[6 + j, i] -= acc[A_T, j] * M[i, g]
+                M[6 + j, i] -= acc[A_T + j, 2] * M[i, g]
+    if b >= 0:
+        for i in range(9):
+            for j in range(3):
+                M[6 + j, i] -= acc[A_T + j, 0] * M[i, b] + acc[A_T + j, 1] * M[i, b + 1]
     for i in range(9):
         for j in range(i + 1):
             P[i, j] = P[j, i] = M[i, j]

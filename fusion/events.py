@@ -61,12 +61,15 @@ class Parameters(NamedTuple):
     lateral_var: float
     vertical_var: float
     per_speed: float
+    learning_ticks: int
+    unknown_var: float
     min_speed: float
     still_window_ns: int
     still_wait_ns: int
     still_ratio: float
     still_accel_var: float
     still_rate_var: float
+    still_drift_var: float
     still_max_speed: float
     zero_velocity_var: float
     zero_rate_var: float

@@ -19,7 +19,7 @@ class Layout(NamedTuple):
     along, left and yaw; pose_yaw (1): constant yaw error of pose fixes, rad; gnss_arm (3): of the lever arm, body m;
     mounting (2): pitch and yaw of the vehicle's axes against the body's, rad; gnss_delay, pose_delay (1): by which a
     measurement is older than its corrected stamp, s; gyro_scale (1): scale error of the gyro about the vertical axis, -
-    (a car hardly turns about the others).
+    (a car hardly turns about the others); gyro_misalignment (2): the share of that turn which the others see, rad.
     """
 
     size: int = ERROR_SIZE
@@ -27,13 +27,14 @@ class Layout(NamedTuple):
     pose_error: int = OFF
     pose_yaw: int = OFF
     gyro_scale: int = OFF
+    gyro_misalignment: int = OFF
     gnss_arm: int = OFF
     mounting: int = OFF
     gnss_delay: int = OFF
     pose_delay: int = OFF
 
 
-_COUNT = {"gnss_error": 3, "pose_error": 3, "gnss_arm": 3, "mounting": 2}
+_COUNT = {"gnss_error": 3, "pose_error": 3, "gnss_arm": 3, "mounting": 2, "gyro_misalignment": 2}
 """States of a block; one where it is not here."""
 
 
@@ -75,6 +76,7 @@ def _priors(vehicle: Vehicle, config: FusionConfig) -> dict[str, float]:
         "pose_error": float(pose.use and pose.lasting_share > 0.0),
         "pose_yaw": math.radians(pose.yaw_offset_sigma_deg) if pose.use else 0.0,
         "gyro_scale": 1e-6 * vehicle.imu.gyro_scale_ppm,
+        "gyro_misalignment": math.radians(vehicle.imu.gyro_misalignment_deg),
         "gnss_arm": vehicle.gnss_lever_arm_sigma_m if gnss.use and estimate.lever_arm else 0.0,
         "mounting": math.radians(estimate.mounting_sigma_deg) if estimate.mounting and vehicle.land_vehicle else 0.0,
         "gnss_delay": estimate.delay_sigma_s if gnss.use and estimate.gnss_delay else 0.0,

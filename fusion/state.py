@@ -55,8 +55,8 @@ A_VG = 8
 A_PG = 11
 """Position against gyro bias."""
 A_T = 14
-"""Integral of the third column of R_enu_body times the body's yaw rate, rad."""
-ACC_SIZE = 15
+"""Integral of R_enu_body times the body's yaw rate, rad."""
+ACC_SIZE = 17
 
 # entries of Core.earth
 G_SIN, G_COS, G_MERIDIAN, G_TRANSVERSE, G_NORTH, G_UP, G_HEIGHT, G_AGE = range(8)
@@ -87,10 +87,11 @@ class Core(NamedTuple):
     clock (6,) int64: times of the state, the last IMU sample and the last motion tick (ns), samples put into the ring,
     whether the sample before the last serves the bend, the interval before the last sample (ns).
     nav (n + 1,); P (n, n); last (2, 6): the last IMU sample (gyro, accel) and the one before it.
-    span (1,): seconds since P was propagated; acc (15, 3): the transition over them (A_*).
+    span (1,): seconds since P was propagated; acc (17, 3): the transition over them (A_*).
     earth (8,): sine and cosine of latitude and what changes slowly (G_*), refreshed now and then.
     ring (N, 6), ring_t (N,): latest IMU samples, N = RING_SIZE or a greater power of two.
     quietest (2,): least variance of the specific force's norm and of the yaw rate in a window so far.
+    slipped (3, 2): what the drive has shown of the rear axle's lateral and vertical velocity (``fusion.motion``).
     aged (3,): seconds since the lasting error of GNSS was moved on, metres since that of pose fixes was, and the
     horizontal variance that the last GNSS position stated.
     doubt (2, 13), doubt_clock (2, 9) int64: the last rejected GNSS position and pose fix (``fusion.recovery``,
@@ -112,6 +113,7 @@ class Core(NamedTuple):
     ring: Floats
     ring_t: Nanoseconds
     quietest: Floats
+    slipped: Floats
     aged: Floats
     doubt: Floats
     doubt_clock: Nanoseconds
@@ -149,6 +151,7 @@ def new_core(size: int = ERROR_SIZE) -> Core:
         ring=np.zeros((RING_SIZE, 6)),
         ring_t=np.zeros(RING_SIZE, np.int64),
         quietest=np.full(2, np.inf),
+        slipped=np.zeros((3, 2)),
         aged=np.zeros(3),
         doubt=np.zeros((2, 13)),
         doubt_clock=np.zeros((2, 9), np.int64),

@@ -49,9 +49,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
     inflation = math.sqrt(pose.inflation)
     layout = layout_of(vehicle, config)
     noise = noise_of(vehicle.imu, config.imu.noise_scale, motion.wheel_scale_walk if motion.wheel else 0.0)
-    noise = noise._replace(
-        gyro_scale=layout.gyro_scale,
-    )
+    noise = noise._replace(gyro_scale=layout.gyro_scale, gyro_misalignment=layout.gyro_misalignment)
     return Parameters(
         noise=noise,
         layout=layout,
@@ -85,12 +83,15 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         lateral_var=motion.lateral_sigma**2,
         vertical_var=motion.vertical_sigma**2,
         per_speed=motion.sigma_per_speed,
+        learning_ticks=round(motion.learning_s * motion.rate_hz),
+        unknown_var=motion.unknown_sigma**2,
         min_speed=motion.min_speed,
         still_window_ns=round(motion.still_window_s * 1e9),
         still_wait_ns=round(motion.still_wait_s * 1e9),
         still_ratio=motion.still_ratio,
         still_accel_var=motion.still_accel**2,
         still_rate_var=float(np.radians(motion.still_rate_deg) ** 2),
+        still_drift_var=motion.still_drift**2,
         still_max_speed=motion.still_max_speed,
         zero_velocity_var=motion.zero_velocity_sigma**2,
         zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2) + noise.gyro_psd * motion.rate_hz,

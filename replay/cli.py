@@ -9,10 +9,11 @@ from typing import Annotated, Any
 
 import tyro
 
+from replay.commands.benching import BENCHMARKS
 from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
-from replay.commands.looking import Bench, View
+from replay.commands.looking import View
 from replay.commands.replaying import Replay
 from sensors.errors import EgolocError
 
@@ -25,15 +26,21 @@ COMMANDS = {
     "score": Score,
     "compare": Compare,
     "view": View,
-    "bench": Bench,
 }
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."
+BENCH_DESCRIPTION = "Measure speed beside other libraries, and how well the filter does where it is hard."
+
+
+def _one_of(commands: dict[str, Any]) -> Any:
+    """The type of a choice between commands."""
+    return reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in commands.items()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 1 some logs failed, 2 a user's mistake (one line on stderr)."""
     given = tuple(sys.argv[1:] if arguments is None else arguments)
-    choices: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
+    bench: Any = Annotated[_one_of(BENCHMARKS), tyro.conf.subcommand("bench", description=BENCH_DESCRIPTION)]
+    choices: Any = _one_of(COMMANDS) | bench
     command = tyro.cli(
         choices,
         prog="egoloc",

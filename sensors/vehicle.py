@@ -25,6 +25,8 @@ class ImuSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Standard deviation of the drifting accelerometer bias (first-order Gauss-Markov), milli-g."""
     gyro_scale_ppm: NonNegative = 0.0
     """Standard deviation of the gyro's scale error about the vertical axis: a state; 0: none, ppm."""
+    gyro_misalignment_deg: NonNegative = 0.0
+    """Standard deviation of how far its other axes see the yaw rate: states beside the scale error, deg."""
     bias_time_constant_s: Positive = 1000.0
     """Correlation time of both drifting biases, s."""
     gyro_turn_on_bias_deg_per_h: NonNegative = 360.0

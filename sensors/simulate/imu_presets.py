@@ -92,6 +92,7 @@ PRESETS: dict[PresetName, ImuPreset] = {
             gyro_turn_on_bias_deg_per_h=1200.0,
             accel_turn_on_bias_mg=10.0,
             gyro_scale_ppm=3000.0,
+            gyro_misalignment_deg=0.2,
         ),
         ImuFlaws(
             gyro_scale_ppm=3000.0,
@@ -115,6 +116,7 @@ PRESETS: dict[PresetName, ImuPreset] = {
             gyro_turn_on_bias_deg_per_h=1800.0,
             accel_turn_on_bias_mg=20.0,
             gyro_scale_ppm=4000.0,
+            gyro_misalignment_deg=0.3,
         ),
         ImuFlaws(
             gyro_scale_ppm=4000.0,

@@ -3,8 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from replay.bench.mcap import PEER, read_with_peer, run, sensors
+from replay.cli import main
 from sensors.mcap.io import read_log, write_log
 
 
@@ -24,3 +26,8 @@ def test_both_readers_read_the_same(tmp_path: Path) -> None:
     assert imu is not None
     peer = read_with_peer(tmp_path / "a.mcap")
     np.testing.assert_array_equal(peer[:, 1:], np.column_stack((imu.gyro, imu.accel)))
+
+
+def test_other_benchmarks_take_no_log(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "mcap", "some.mcap"]) == 2
+    assert "bench mcap: expected no log, got some.mcap" in capsys.readouterr().err

@@ -6,15 +6,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from fusion.config import FusionConfig, MotionModel
 from replay.config import HideGnss, RunConfig
 from replay.harness import replay_source
 from sensors.datasets import load
 from sensors.records import Log
 from tests.replay.cutting import Memory
-
-WIDE = FusionConfig(motion=MotionModel(lateral_sigma=0.2, sigma_per_speed=0.02))
-"""As docs/datasets.md says."""
 
 
 @pytest.fixture(scope="module")
@@ -26,14 +22,14 @@ def kitti() -> Log:
 
 
 def test_no_position_of_the_drive_is_rejected(kitti: Log, tmp_path: Path) -> None:
-    metrics = replay_source(Memory(kitti), tmp_path / "run", RunConfig(fusion=WIDE))
+    metrics = replay_source(Memory(kitti), tmp_path / "run", RunConfig())
     counts = metrics["decisions"]["gnss_position"]
     assert counts["accepted"] >= 465
     assert "chi_square" not in counts
 
 
 def test_drift_over_hidden_seconds_is_as_large_as_stated(kitti: Log, tmp_path: Path) -> None:
-    config = msgspec.structs.replace(RunConfig(fusion=WIDE), hide_gnss=HideGnss(30.0, 5.0))
+    config = msgspec.structs.replace(RunConfig(), hide_gnss=HideGnss(30.0, 5.0))
     hidden = replay_source(Memory(kitti), tmp_path / "run", config)["hidden"]
     assert hidden["stretches"] == 15
     assert hidden["end_horizontal_m"]["p50"] < 0.6

@@ -1,0 +1,209 @@
+"""egoloc bench: speed beside other libraries, and how well the filter does where it is hard."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from replay.commands.output import print_json, stage
+from sensors.errors import EgolocError
+
+
+@dataclass(frozen=True)
+class BenchFilter:
+    """IMU steps/s of the whole filter, beside filterpy, gtsam and pyins, on one core."""
+
+    repeats: int = 5
+    """Timed calls of each row, after one that warms up; the median counts."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import filter
+
+        _timed("filter", lambda: filter.run(self.repeats), self.json)
+
+
+@dataclass(frozen=True)
+class BenchLive:
+    """Time of a call of Localizer.push in arrival order, on one core."""
+
+    repeats: int = 5
+    """Drives of which each call's least time counts."""
+    hours: float = 1.0
+    """Length of the drive, h."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import live
+
+        _timed("live", lambda: live.run(self.repeats, (self.hours,)), self.json)
+
+
+@dataclass(frozen=True)
+class BenchReplay:
+    """A log to metrics.json: times real time, stages and memory, on one core."""
+
+    repeats: int = 5
+    """Timed runs, after one that warms up; the median counts."""
+    hours: tuple[float, ...] = (1.0,)
+    """Lengths of the log, h: figures of each and how the time grows."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import replay
+
+        _timed("replay", lambda: replay.run(self.repeats, self.hours), self.json)
+
+
+@dataclass(frozen=True)
+class BenchMcap:
+    """IMU messages/s read from MCAP, beside the mcap package's own decoders, on one core."""
+
+    repeats: int = 5
+    """Timed calls of each row, after one that warms up; the median counts."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import mcap
+
+        _timed("mcap", lambda: mcap.run(self.repeats), self.json)
+
+
+@dataclass(frozen=True)
+class BenchGates:
+    """Naive gates beside ours, on scenes in which a naive one fails: AR and largest errors."""
+
+    drives: int = 5
+    """Simulated drives of each scene."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import gates
+
+        _printed("gates", lambda _: gates.run(self.drives), gates.table, self.json)
+
+
+@dataclass(frozen=True)
+class BenchFaults:
+    """Errors, recovery and warnings for every fault that --inject knows, on simulated drives."""
+
+    drives: int = 4
+    """Simulated drives; figures are the worst of them."""
+    seed: int = 6000
+    """Seed of the first of them."""
+    short: bool = False
+    """One drive and the medium severity alone."""
+    markdown: Annotated[Path | None, tyro.conf.arg(metavar="FILE.md", help_behavior_hint="(default: none)")] = None
+    """Write the tables there as well."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import faults
+        from replay.fault_tables import fault_tables, markdown
+        from replay.table import output_console
+
+        if self.drives < 1 or self.seed < 0:
+            raise EgolocError(f"bench: --drives, --seed: expected 1 or more, 0 or more, got {self.drives}, {self.seed}")
+        with stage("benchmark faults") as tell:
+            found = faults.matrix_of(self.drives, self.seed, short=self.short, tell=tell)
+        if self.markdown is not None:
+            self.markdown.write_text(markdown(found))
+        if self.json:
+            print_json(faults.report(found))
+        else:
+            output_console().print(fault_tables(found))
+
+
+@dataclass(frozen=True)
+class BenchHidden:
+    """How far off after GNSS has been hidden for a while, beside pyins and gtsam on the same data."""
+
+    logs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="LOG...", help_behavior_hint="(default: simulated drives of three IMU grades)"),
+    ] = ()
+    """Recorded logs."""
+    lengths: tuple[float, ...] = (15.0, 60.0)
+    """How long GNSS is hidden, s."""
+    every: float = 10.0
+    """From the start of a stretch to that of the next, s."""
+    begin: Annotated[tuple[float, ...], tyro.conf.arg(name="from")] = (60.0,)
+    """Stretches begin so long after the first GNSS position at least; several make as many windows, s."""
+    end: Annotated[tuple[float, ...], tyro.conf.arg(name="to", help_behavior_hint="(default: the log's end)")] = ()
+    """They end so long after it at most, one number for each --from, s."""
+    peers: Annotated[
+        tuple[Literal["pyins", "gtsam"], ...] | None, tyro.conf.arg(help_behavior_hint="(default: those installed)")
+    ] = None
+    """Which others are run."""
+    halves: bool = False
+    """Rows of the drive's first and second half as well: importers calibrate on the first."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import hidden
+        from replay.bench.hidden_table import hidden_table
+
+        windows = hidden_windows(self.begin, self.end)
+        work = lambda _: hidden.run(self.logs, self.lengths, self.every, windows, self.peers, self.halves)  # noqa: E731
+        _printed("hidden", work, hidden_table, self.json)
+
+
+BENCHMARKS = {
+    "filter": BenchFilter,
+    "live": BenchLive,
+    "replay": BenchReplay,
+    "mcap": BenchMcap,
+    "gates": BenchGates,
+    "faults": BenchFaults,
+    "hidden": BenchHidden,
+}
+
+
+def hidden_windows(begin: tuple[float, ...], end: tuple[float, ...]) -> list[tuple[float, float]]:
+    """Windows in which stretches lie, s since the first position. Raises where the numbers make none."""
+    if end and len(end) != len(begin):
+        raise EgolocError(f"--to: expected {len(begin)} numbers, one for each of --from, got {len(end)}")
+    windows = list(zip(begin, end or (math.inf,) * len(begin), strict=True))
+    for first, last in windows:
+        if not 0.0 <= first < last:
+            raise EgolocError(f"--from, --to: expected 0 <= from < to, got {first:g} and {last:g}")
+    return windows
+
+
+def _timed(name: str, work: Callable[[], Any], as_json: bool) -> None:
+    """A benchmark of speed."""
+    from replay.table import bench_table
+
+    _printed(name, lambda _: work(), bench_table, as_json)
+
+
+def _printed(
+    name: str, work: Callable[[Callable[[str], None]], Any], table: Callable[[Any], Any], as_json: bool
+) -> None:
+    """Run on one core, print the result as a table or as JSON. work: hears where it may tell what it is doing."""
+    from replay.bench.measure import one_core
+    from replay.table import output_console
+
+    with stage(f"benchmark {name}") as tell, one_core():
+        result = work(tell)
+    if as_json:
+        print_json(result)
+    else:
+        output_console().print(table(result))
