@@ -17,6 +17,7 @@ from fusion.motion import clear, motion
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, RING_SIZE, Core, Floats
+from fusion.tape import note_coast, note_correction, note_move, note_state
 from sensors._kernels import radii
 from sensors.kernel import kernel
 
@@ -32,7 +33,7 @@ _RECEIVER = int(Reason.RECEIVER)
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
-_GAP_STEP_NS = 50_000_000
+GAP_STEP_NS = 50_000_000
 """A gap is crossed in steps of at most this."""
 Part = tuple[Interval, float, float, float]
 """Part a..b of an interval (0..1) and its length in seconds."""
@@ -71,7 +72,7 @@ def process(
         while True:
             now = clock[C_STATE]
             target = ev.t[e] if e < events and ev.t[e] < t else t
-            stop = min(target, now + _GAP_STEP_NS) if gap else target
+            stop = min(target, now + GAP_STEP_NS) if gap else target
             if stop > now:
                 if whole > par.bridge_ns:
                     _coast(core, par, (stop - now) * 1e-9)
@@ -79,7 +80,7 @@ def process(
                     part = (interval, (now - start) / whole, (stop - start) / whole, (stop - now) * 1e-9)
                     _advance(nav, earth, acc, span, part)
                     if gap:
-                        propagate(nav, earth, core.P, acc, span, (core.phi, core.M, core.Mt), par.noise)
+                        _move(core, par)
                         widen(core.P, (stop - now) * 1e-9, par.coast_accel, par.coast_rate)
                 clock[C_STATE] = stop
             if stop == t and not remembered:
@@ -164,7 +165,7 @@ def _remember(core: Core, t: int, w: Vector, f: Vector) -> None:
 @kernel(inline="always")
 def _coast(core: Core, par: Parameters, dt: float) -> None:
     """Bridge a gap in the IMU at constant velocity and attitude, with the covariance widened."""
-    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+    _move(core, par)
     nav = core.nav
     meridian, transverse = radii(np.sin(nav[0]))
     nav[1] += nav[3] * dt / ((transverse + nav[2]) * np.cos(nav[0]))
@@ -172,6 +173,15 @@ def _coast(core: Core, par: Parameters, dt: float) -> None:
     nav[2] += nav[5] * dt
     refresh(nav, core.earth)
     coast(core.P, dt, par.coast_accel, par.coast_rate)
+    note_coast(core, dt)
+
+
+@kernel(inline="always")
+def _move(core: Core, par: Parameters) -> None:
+    """Bring P up to the state's time."""
+    if core.span[0] != 0.0:
+        propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+        note_move(core)
 
 
 @kernel(inline="always")
@@ -181,9 +191,10 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
     if ev.verdict[e] >= 0:
         _record(rec, e, kind, 0, ev.verdict[e])
         return
-    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+    _move(core, par)
     if kind == OUTPUT:
-        _record_state(core, rec, ev.t[e])
+        record_state(core, rec, ev.t[e])
+        note_state(core, ev.t[e])
         return
     accepted = _ACCEPTED
     if kind == MOTION:
@@ -293,6 +304,7 @@ def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accept
     if not score <= threshold:
         return False
     correct(core.nav, core.earth, core.P, core.W, core.dx, residual, dof)
+    note_correction(core, dof)
     dx = core.dx
     rec.reason[k] = accepted
     rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
@@ -313,8 +325,8 @@ def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> in
     return k
 
 
-@kernel(inline="always")
-def _record_state(core: Core, rec: Recorder, t: int) -> None:
+@kernel()
+def record_state(core: Core, rec: Recorder, t: int) -> None:
     """Record nav, the pose covariance (position, attitude) and every sigma."""
     P = core.P
     k = rec.filled[0]

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion._kernels import process
+from fusion._kernels import GAP_STEP_NS, process
 from fusion.alignment import SERVING, Aligner, Initial
 from fusion.config import FusionConfig
 from fusion.events import OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
@@ -18,6 +18,7 @@ from fusion.recording import decisions, join, states, unused
 from fusion.result import Decisions, Reason, States
 from fusion.sources import APPLY, RECORDS, joined, sources, split
 from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, Core, new_core
+from fusion.tape import Tape, portions
 from fusion.timeline import merge, parameters
 from sensors import pieces
 from sensors.clock import NS_PER_S
@@ -35,12 +36,20 @@ _NEVER, _EVER = 2**63 - 1, -(2**63)
 class Navigator:
     """Measurements wait in ``pending`` until ``advance`` passes them; what was decided is taken out."""
 
-    def __init__(self, vehicle: Vehicle, map_frame: MapFrame | None, config: FusionConfig, kept_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        map_frame: MapFrame | None,
+        config: FusionConfig,
+        kept_s: float = 0.0,
+        tape: Tape | None = None,
+    ) -> None:
         """kept_s: IMU samples before the time that ``advance`` was given are kept so long while not aligned, besides
-        what alignment itself looks back on: only measurements that come late need more."""
+        what alignment itself looks back on: only measurements that come late need more. tape: for the smoother."""
         self._empty = Log(vehicle=vehicle, map_frame=map_frame)
         self._config, self._par = config, parameters(vehicle, config)
         self._aligner = Aligner(vehicle, config, self._par)
+        self._tape = tape
         self._kept_ns = round((config.alignment.window_s + kept_s) * NS_PER_S)
         self._rows = dict.fromkeys(RECORDS, 0)
         self._imu: list[Imu] = []
@@ -133,7 +142,7 @@ class Navigator:
         events = timeline.events
         outputs = int((events.kind == OUTPUT).sum())
         recorder = new_recorder(outputs, len(events.t) - outputs)
-        feed(core, imu, events, found.measurements, self._par, recorder)
+        feed(core, imu, events, found.measurements, self._par, recorder, self._tape)
         if outputs:
             self._states.append(states(recorder))
         if recorder.filled[1]:
@@ -156,13 +165,30 @@ def start(initial: Initial, imu: Imu) -> Core:
     return core
 
 
-def feed(core: Core, imu: Imu, events: Events, measurements: Measurements, par: Parameters, rec: Recorder) -> None:
+def feed(
+    core: Core,
+    imu: Imu,
+    events: Events,
+    measurements: Measurements,
+    par: Parameters,
+    rec: Recorder,
+    tape: Tape | None = None,
+) -> None:
     """Run the kernel over an IMU record and all events up to its last sample.
 
-    Every column goes in read-only and contiguous: one compiled kernel serves every log, whatever its sensors.
+    Every column goes in read-only and contiguous: one compiled kernel serves every log, whatever its sensors. With a
+    tape it goes by portions, which changes nothing but the memory that the tape needs.
     """
     columns = Measurements(*(_read_only(column) for column in measurements))
-    process(core, _read_only(imu.t_ns), _read_only(imu.gyro), _read_only(imu.accel), events, 0, columns, par, rec)
+    t, gyro, accel = _read_only(imu.t_ns), _read_only(imu.gyro), _read_only(imu.accel)
+    if tape is None:
+        process(core, t, gyro, accel, events, 0, columns, par, rec)
+        return
+    first = 0
+    for part, numbers in list(portions(core, t, events.t, par, GAP_STEP_NS)):
+        threaded, before = tape.threaded(core, numbers), int(rec.filled[0])
+        first = process(threaded, t[part], gyro[part], accel[part], events, first, columns, par, rec)
+        tape.keep(threaded, int(rec.filled[0]) - before)
 
 
 def _read_only(column: NDArray[Scalar]) -> NDArray[Scalar]:

@@ -75,6 +75,8 @@ class Core(NamedTuple):
     doubt (2, 8), doubt_clock (2, 3) int64: the last rejected GNSS position and pose fix (``fusion.recovery``).
     phi, M (9, 16), Mt (16, 16), H, W (3, 16), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (16,): scratch.
+    stay (16,): share of each error from the tenth on that the last propagation kept, all 1 so far.
+    tape (K,), tape_end (1,): what ``fusion.tape`` puts down; K = 0: nothing.
     """
 
     clock: Nanoseconds
@@ -99,6 +101,9 @@ class Core(NamedTuple):
     eigen: Floats
     residual: Floats
     dx: Floats
+    stay: Floats
+    tape: Floats
+    tape_end: Nanoseconds
 
 
 def new_core() -> Core:
@@ -126,4 +131,7 @@ def new_core() -> Core:
         eigen=np.zeros((2, 3, 3)),
         residual=np.zeros(3),
         dx=np.zeros(ROW),
+        stay=np.ones(ROW),
+        tape=np.empty(0),
+        tape_end=np.zeros(1, np.int64),
     )
