@@ -57,7 +57,7 @@ def _back_over_move(tape: Floats, end: int, phi: Floats, lam: Floats, Lam: Float
     """Phi' lambda and Phi' Lambda Phi; Phi: phi (9, 16) above a diagonal."""
     size, columns = len(lam), phi.shape[1]
     diagonal = end - size  # + j: of row j, from 9 on
-    start = diagonal + 9 - 9 * columns
+    start: int = diagonal + 9 - 9 * columns
     for i in range(9):
         for j in range(columns):
             phi[i, j] = tape[start + i * columns + j]

@@ -15,7 +15,7 @@ class Spool:
     """A file without a name in a folder (None: the system's for temporary files): it is gone when the program is."""
 
     def __init__(self, folder: Path | None = None) -> None:
-        self._file = TemporaryFile(dir=folder)
+        self._file = TemporaryFile(dir=folder)  # noqa: SIM115 - closed by close
         self._starts: list[tuple[int, int]] = []  # offset, and how many arrays
 
     def append(self, *arrays: NDArray[Any]) -> None:

@@ -44,6 +44,7 @@ class Facts(TypedDict):
     stretches: list[tuple[int, int]] | None
     warnings: list[dict[str, str]]
     left_out: list[dict[str, str | int]]
+    smoothed: NotRequired[bool]
 
 
 class Manifest(TypedDict):
