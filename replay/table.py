@@ -249,8 +249,8 @@ def _drift(hidden: Metrics) -> Iterator[str]:
     if hidden.get("smoothed", {}).get("error_over_sigma_rms") is not None:
         before, after = hidden["largest_horizontal_m"], hidden["smoothed"]["largest_horizontal_m"]
         yield (
-            f"Largest horizontal error within them: median {before['p50']:.3f} m, largest {before['max']:.3f} m; smoothed "
-            f"{after['p50']:.3f} m, {after['max']:.3f} m, error over sigma, rms "
+            f"Largest horizontal error within them: median {before['p50']:.3f} m, largest {before['max']:.3f} m; "
+            f"smoothed: median {after['p50']:.3f} m, largest {after['max']:.3f} m, error over sigma, rms "
             f"{hidden['smoothed']['error_over_sigma_rms']:.2f}."
         )
     if hidden["without_end"]:
