@@ -173,7 +173,8 @@ def _coast(core: Core, par: Parameters, dt: float) -> None:
     nav[2] += nav[5] * dt
     refresh(nav, core.earth)
     coast(core.P, dt, par.coast_accel, par.coast_rate)
-    note_coast(core, dt)
+    if len(core.tape):
+        note_coast(core.tape, core.tape_end, dt)
 
 
 @kernel(inline="always")
@@ -181,7 +182,8 @@ def _move(core: Core, par: Parameters) -> None:
     """Bring P up to the state's time."""
     if core.span[0] != 0.0:
         propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
-        note_move(core)
+        if len(core.tape):
+            note_move(core.tape, core.tape_end, core.phi, core.stay)
 
 
 @kernel(inline="always")
@@ -194,7 +196,8 @@ def _handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Eve
     _move(core, par)
     if kind == OUTPUT:
         record_state(core, rec, ev.t[e])
-        note_state(core, ev.t[e])
+        if len(core.tape):
+            note_state(core.tape, core.tape_end, core.nav, core.P, ev.t[e])
         return
     accepted = _ACCEPTED
     if kind == MOTION:
@@ -304,7 +307,8 @@ def _apply(core: Core, rec: Recorder, k: int, dof: int, threshold: float, accept
     if not score <= threshold:
         return False
     correct(core.nav, core.earth, core.P, core.W, core.dx, residual, dof)
-    note_correction(core, dof)
+    if len(core.tape):
+        note_correction(core.tape, core.tape_end, (core.H, core.L, core.W), residual, core.dx, dof)
     dx = core.dx
     rec.reason[k] = accepted
     rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
@@ -325,7 +329,7 @@ def _record(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> in
     return k
 
 
-@kernel()
+@kernel(inline="always")
 def record_state(core: Core, rec: Recorder, t: int) -> None:
     """Record nav, the pose covariance (position, attitude) and every sigma."""
     P = core.P

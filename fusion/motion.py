@@ -128,4 +128,5 @@ def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
         residual[i] = mean[i] - earth[i] - nav[10 + i]
     if innovate(core.P, core.H, core.W, 3, R, core.L) and whiten(3, residual, core.L) <= par.gate[2]:
         correct(nav, core.earth, core.P, core.W, core.dx, residual, 3)
-        note_correction(core, 3)
+        if len(core.tape):
+            note_correction(core.tape, core.tape_end, (core.H, core.L, core.W), residual, core.dx, 3)

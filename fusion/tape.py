@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from fusion.events import Parameters
 from fusion.spool import Spool
-from fusion.state import C_SAMPLE, Core, Floats
+from fusion.state import C_SAMPLE, Core, Floats, Nanoseconds
 from sensors.clock import NS_PER_S
 from sensors.kernel import kernel
 
 MOVED, COASTED, CORRECTED, RECORDED = 1.0, 2.0, 3.0, 4.0
 _SECOND = NS_PER_S
+Gain = tuple[Floats, Floats, Floats]
 
 PORTION = 1 << 20
 """Numbers that a portion of a drive may put on the tape: 8 MB of memory."""
@@ -32,13 +33,10 @@ _CORRECTIONS = 3
 
 
 @kernel()
-def note_move(core: Core) -> None:
+def note_move(tape: Floats, tape_end: Nanoseconds, phi: Floats, stay: Floats) -> None:
     """Put down the transition that P has just gone through."""
-    tape, phi, stay = core.tape, core.phi, core.stay
-    if len(tape) == 0:
-        return
-    end, columns = core.tape_end[0], phi.shape[1]
-    core.tape_end[0] = last = end + 9 * columns + len(stay) - 8
+    end, columns = tape_end[0], phi.shape[1]
+    tape_end[0] = last = end + 9 * columns + len(stay) - 8
     if last > len(tape):
         return
     for i in range(9):
@@ -52,25 +50,24 @@ def note_move(core: Core) -> None:
 
 
 @kernel()
-def note_coast(core: Core, seconds: float) -> None:
+def note_coast(tape: Floats, tape_end: Nanoseconds, seconds: float) -> None:
     """Put down that P went on at constant velocity."""
-    tape, end = core.tape, core.tape_end[0]
-    if len(tape) == 0:
-        return
-    core.tape_end[0] = end + 2
+    end = tape_end[0]
+    tape_end[0] = end + 2
     if end + 2 <= len(tape):
         tape[end], tape[end + 1] = seconds, COASTED
 
 
 @kernel()
-def note_correction(core: Core, dof: int) -> None:
-    """Put down the correction just made: what ``innovate``, ``whiten`` and ``correct`` left in the core."""
-    tape, H, W, L = core.tape, core.H, core.W, core.L
-    if len(tape) == 0:
-        return
-    end, size = core.tape_end[0], len(core.dx)
-    core.tape_end[0] = end + dof * (2 * size + 1) + 5
-    if core.tape_end[0] > len(tape):
+def note_correction(tape: Floats, tape_end: Nanoseconds, gain: Gain, white: Floats, dx: Floats, dof: int) -> None:
+    """Put down the correction just made: what ``innovate``, ``whiten`` and ``correct`` left in the core.
+
+    gain: H (3, n), L (3, 3) and W (3, n); white (3,); dx (n,).
+    """
+    H, L, W = gain
+    end, size = tape_end[0], len(dx)
+    tape_end[0] = end + dof * (2 * size + 1) + 5
+    if tape_end[0] > len(tape):
         return
     for i in range(dof):
         row = end + i * size
@@ -87,22 +84,19 @@ def note_correction(core: Core, dof: int) -> None:
             tape[end] = W[i, j]
             end += 1
     for i in range(dof):
-        tape[end] = core.residual[i]
+        tape[end] = white[i]
         end += 1
     for i in range(3):
-        tape[end + i] = 0.5 * core.dx[6 + i]
+        tape[end + i] = 0.5 * dx[6 + i]
     tape[end + 3], tape[end + 4] = dof, CORRECTED
 
 
 @kernel()
-def note_state(core: Core, t: int) -> None:
+def note_state(tape: Floats, tape_end: Nanoseconds, nav: Floats, P: Floats, t: int) -> None:
     """Put down nav and P at time t, ns."""
-    tape, nav, P = core.tape, core.nav, core.P
-    if len(tape) == 0:
-        return
-    end, size = core.tape_end[0], P.shape[0]
-    core.tape_end[0] = end + len(nav) + size * (size + 1) // 2 + 3
-    if core.tape_end[0] > len(tape):
+    end, size = tape_end[0], P.shape[0]
+    tape_end[0] = end + len(nav) + size * (size + 1) // 2 + 3
+    if tape_end[0] > len(tape):
         return
     for i in range(len(nav)):
         tape[end] = nav[i]
