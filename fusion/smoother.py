@@ -6,7 +6,7 @@ plain form inverts the predicted covariance at every step, this inverts nothing:
 over a gap, need no care. lambda has the sign of the correction (Bierman's is the other).
 
 Over a transition lambda' = Phi' lambda, Lambda' = Phi' Lambda Phi. Over a correction with J = L^-1 H, K = W' L^-1 and
-the whitened innovation w: lambda' = lambda + J' (w - W lambda), Lambda' = (I - W' J)' Lambda (I - W' J) + J' J.
+the whitened innovation w: lambda' = (I - W' J)' lambda + J' w, Lambda' = (I - W' J)' Lambda (I - W' J) + J' J.
 Over the reset of the attitude error with G: lambda' = G' lambda, Lambda' = G' Lambda G.
 """
 
@@ -47,7 +47,7 @@ def retrace(tape: Floats, core: Core, lam: Floats, Lam: Floats, work: Floats, re
         elif kind == COASTED:
             end = _back_over_coast(tape, end - 1, lam, Lam)
         elif kind == CORRECTED:
-            end = _back_over_correction(tape, end - 1, core, lam, Lam)
+            end = _back_over_correction(tape, end - 1, lam, Lam, work)
         else:
             end = _smooth(tape, end - 1, core, lam, Lam, work, rec)
 
@@ -101,8 +101,12 @@ def _back_over_coast(tape: Floats, end: int, lam: Floats, Lam: Floats) -> int:
 
 
 @kernel(fastmath={"contract"})
-def _back_over_correction(tape: Floats, end: int, core: Core, lam: Floats, Lam: Floats) -> int:
-    """Over the reset and then the measurement."""
+def _back_over_correction(tape: Floats, end: int, lam: Floats, Lam: Floats, work: Floats) -> int:
+    """Over the reset and then the measurement.
+
+    I - W' J is formed first: where a wide P meets a sharp measurement it is tiny, and Lambda - J' (...) in its place
+    would lose as many digits as P falls by orders of magnitude.
+    """
     size, dof = len(lam), int(tape[end - 1])
     half = end - 4
     h = (-tape[half], -tape[half + 1], -tape[half + 2])
@@ -110,32 +114,37 @@ def _back_over_correction(tape: Floats, end: int, core: Core, lam: Floats, Lam: 
     a, b, c = lam[6], lam[7], lam[8]
     lam[6], lam[7], lam[8] = a + (h[1] * c - h[2] * b), b + (h[2] * a - h[0] * c), c + (h[0] * b - h[1] * a)
     white = half - dof
-    W, J = white - dof * size, white - 2 * dof * size  # first numbers of both on the tape
-    C, e = core.W, core.residual
-    for i in range(dof):
-        e[i] = tape[white + i]
+    W, J = white - dof * size, white - 2 * dof * size  # where both begin on the tape
+    left, moved = work[0], work[1]  # I - W' J, and Lambda (I - W' J)
+    for i in range(size):
         for j in range(size):
-            e[i] -= tape[W + i * size + j] * lam[j]
-            C[i, j] = 0.0
+            left[i, j] = 1.0 if i == j else 0.0
+            moved[i, j] = 0.0
+        for k in range(dof):
+            for j in range(size):
+                left[i, j] -= tape[W + k * size + i] * tape[J + k * size + j]
+    for i in range(size):
         for k in range(size):
             for j in range(size):
-                C[i, j] += tape[W + i * size + k] * Lam[k, j]
-    for i in range(dof):  # B = I + W Lambda W'
-        for k in range(dof):
-            core.L[i, k] = 1.0 if i == k else 0.0
-            for j in range(size):
-                core.L[i, k] += C[i, j] * tape[W + k * size + j]
-    for i in range(dof):  # C = W Lambda - B J / 2, and Lambda -= J' C + C' J
-        for k in range(dof):
-            for j in range(size):
-                C[i, j] -= 0.5 * core.L[i, k] * tape[J + k * size + j]
-    for k in range(dof):
-        for i in range(size):
-            for j in range(size):
-                Lam[i, j] -= tape[J + k * size + i] * C[k, j] + C[k, i] * tape[J + k * size + j]
+                moved[i, j] += Lam[i, k] * left[k, j]
+    for i in range(size):
         for j in range(size):
-            lam[j] += tape[J + k * size + j] * e[k]
+            Lam[i, j] = 0.0
+        for k in range(dof):
+            for j in range(size):
+                Lam[i, j] += tape[J + k * size + i] * tape[J + k * size + j]
+        for k in range(size):
+            for j in range(size):
+                Lam[i, j] += left[k, i] * moved[k, j]
     _mirror(Lam)
+    for j in range(size):
+        moved[0, j] = 0.0
+        for k in range(size):
+            moved[0, j] += left[k, j] * lam[k]
+        for k in range(dof):
+            moved[0, j] += tape[J + k * size + j] * tape[white + k]
+    for j in range(size):
+        lam[j] = moved[0, j]
     return J
 
 

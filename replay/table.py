@@ -196,8 +196,8 @@ def _stretch_table(hidden: Metrics) -> Table:
 def _worst(entry: Metrics) -> tuple[str, str, str]:
     """The largest error of a stretch, that of the smoothed states, and the rms of their error over sigma."""
     before, after = entry.get("within") or {}, entry.get("smoothed") or {}
-    largest = (number(found.get("largest_horizontal_m"), 3) for found in (before, after))
-    return *largest, number(after.get("error_over_sigma_rms"), 2)
+    worst, smoothed = (number(found.get("largest_horizontal_m"), 3) for found in (before, after))
+    return worst, smoothed, number(after.get("error_over_sigma_rms"), 2)
 
 
 def number(value: float | None, digits: int) -> str:

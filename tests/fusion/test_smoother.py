@@ -12,14 +12,21 @@ from scipy.spatial.transform import Rotation
 import fusion._kernels
 import fusion.motion
 import fusion.navigator
+import fusion.tape
+from fusion.config import FusionConfig
 from fusion.result import States
-from fusion.run import run
-from fusion.smoother import smooth
+from fusion.run import Session, run
+from fusion.smoother import smooth, smoothed
 from fusion.state import Core
+from fusion.tape import Tape
 from sensors.records import Log
 from sensors.simulate import scenarios
-from sensors.simulate.drive import simulate
-from tests.fusion.scenes import later, with_gap
+from sensors.simulate.drive import simulate, simulate_drive
+from sensors.simulate.trajectory import Truth
+from tests.fusion.free import HONEST_FREE
+from tests.fusion.scenes import later, only, seconds, with_gap, with_outage
+from tests.fusion.test_consistency import pose_and_velocity_nees
+from tests.fusion.test_session import assert_same, cuts_of, pieces
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +64,8 @@ class Watch:
             if core.span[0] != 0.0:
                 before = core.P.copy()
                 real["_move"](core, par)
-                phi = np.eye(len(before))
+                phi = np.diag(core.stay)
+                phi[:9] = 0.0
                 phi[:9, : core.phi.shape[1]] = core.phi
                 self._add("move", Step(before, core.P.copy(), phi=phi))
 
@@ -113,6 +121,7 @@ def rts(steps: list[Step]) -> dict[int, tuple[Floats, Floats]]:
     """t -> smoothed error and covariance: Rauch, Tung and Striebel's recursion on dense matrices."""
     found = {}
     P = steps[-1].after
+    assert (np.diag(P) > 0).all()  # it is inverted
     d = np.zeros(len(P))
     for step in reversed(steps):
         if step.phi is not None:
@@ -172,6 +181,88 @@ def test_equals_dense_rts(log: Log, scene: str, monkeypatch: pytest.MonkeyPatch)
         apart = states.pose_cov[i] - P[np.ix_(pose, pose)]
         assert np.abs(apart / np.outer(sigma[pose], sigma[pose])).max() < TOLERANCE
     assert np.abs(moved / states.sigma).max() > 1.0  # it did something
+
+
+def test_portions_and_pieces_change_no_bit(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither where the tape is cut, nor the drive; and the filter does not notice that it is taken down."""
+    drive, config = rough(log), FusionConfig(output_hz=20.0)
+    plain = run(drive, config)
+    result, whole = smooth(drive, config)
+    assert_same(plain, result)
+    monkeypatch.setattr(fusion.tape, "PORTION", 20_000)
+    for seed in range(3):
+        tape = Tape()
+        session = Session(drive.vehicle, drive.map_frame, config, tape)
+        for piece in pieces(drive, cuts_of(drive, seed)):
+            session.push(piece)
+        session.finish()
+        parts = list(smoothed(tape))
+        assert len(parts) > 10
+        for name in whole.__dataclass_fields__:
+            found = np.concatenate([getattr(part, name) for part in parts])
+            assert found.tobytes() == getattr(whole, name).tobytes(), name
+
+
+@pytest.mark.parametrize("portion", [1, 3_000, 100_000])
+def test_the_tape_never_needs_more_than_was_set_aside(log: Log, portion: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With events of every kind at every sample, and gaps: ``Tape.keep`` raises where numbers did not fit."""
+    monkeypatch.setattr(fusion.tape, "PORTION", portion)
+    result, states = smooth(rough(log), FusionConfig(output_hz=100.0))
+    assert len(states) == len(result.states) > 3000
+    assert np.isfinite(states.sigma).all()
+
+
+def test_a_drive_that_never_aligns_has_no_smoothed_states(log: Log) -> None:
+    result, states = smooth(only(log, "wheel"))
+    assert result.aligned_ns is None
+    assert len(states) == 0
+
+
+def test_consistent_and_better_than_the_filter_through_outages() -> None:
+    """White noise, honest figures: NEES as stated; within outages the largest error falls on every drive."""
+    scores = []
+    for seed in range(12):
+        drive = simulate_drive(70.0, 2000 + seed, scenarios.load("clean"))
+        log = with_outage(drive.log, 25.0, 30.0)
+        result, states = smooth(log, HONEST_FREE)
+        after = replace(result, states=states)
+        pose, velocity = pose_and_velocity_nees(after, drive.truth)
+        scores.append((pose.mean() / 6, velocity.mean() / 3))
+        hidden = (seconds(log, states.t_ns) > 25.0) & (seconds(log, states.t_ns) < 55.0)
+        assert hidden.sum() > 290
+        before, then = (worst(of, drive.truth, hidden) for of in (result.states, states))
+        assert then < 0.5 * before
+        assert (states.sigma <= result.states.sigma * (1 + 1e-6)).all()
+    mean = np.mean(scores, axis=0)
+    print(f"NEES per degree of freedom: pose {mean[0]:.3f}, velocity {mean[1]:.3f}")
+    assert mean == pytest.approx([1.0, 1.0], abs=0.25)
+
+
+def test_a_minute_without_imu(log: Log) -> None:
+    """P grows to 700 m and falls to a centimetre at the first fix: no digit is lost that smoothing needs."""
+    assert log.imu is not None
+    middle = int(log.imu.t_ns[2000])
+    pause = 60 * 10**9
+
+    def apart(record: Any) -> Any:
+        return record and replace(record, t_ns=record.t_ns + np.where(record.t_ns > middle, pause, 0))
+
+    names = ("imu", "gnss", "gnss_velocity", "pose_fixes", "wheel")
+    drive = replace(log, reference=None, **{name: apart(getattr(log, name)) for name in names})
+    result, states = smooth(drive, FusionConfig())
+    assert np.linalg.eigvalsh(states.pose_cov).min() > 0.0
+    horizontal = np.hypot(states.sigma[:, 0], states.sigma[:, 1])
+    inside = (states.t_ns > middle) & (states.t_ns < middle + pause)
+    assert 100.0 < horizontal[inside].max() < 0.2 * result.states.sigma[inside, :2].max()
+    assert horizontal[~inside].max() < 0.05
+
+
+def worst(of: States, truth: Truth, rows: NDArray[np.bool_]) -> float:
+    """Largest horizontal error, m."""
+    known = truth.at(of.t_ns[rows]).llh
+    d = known - of.llh[rows]
+    meridian, transverse = radii_of(known[:, 0])
+    return float(np.hypot(d[:, 0] * meridian, d[:, 1] * transverse * np.cos(known[:, 0])).max())
 
 
 def displacement(of: States, to: States) -> Floats:
