@@ -102,7 +102,9 @@ class TestRun:
         assert (t[0] % 10**9 == 0).all()
 
     def test_a_drive_that_never_aligns(self, log: Log, tmp_path: Path) -> None:
-        lost = replace(log, gnss=None, gnss_velocity=None, pose_fixes=None)
+        assert log.gnss is not None
+        standing = replace(log.gnss[:20], yaw=None, yaw_sigma=None)
+        lost = replace(log, gnss=standing, gnss_velocity=None, pose_fixes=None)
         replay_source(Memory(lost), tmp_path / "run", SMOOTH)
         table = columns(tmp_path / "run" / "smoothed.parquet")
         assert len(table["t_ns"]) > 1000
