@@ -8,19 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._linalg import Vector, attitude, axpy, blend, matvec
-from fusion.covariance import accumulate, coast, propagate, widen
+from fusion.covariance import accumulate, coast, widen
 from fusion.events import AGAIN, MOTION, Events, Measurements, Parameters, Recorder
 from fusion.layout import Layout
 from fusion.mechanization import increments, refresh, strapdown
 from fusion.snapshots import S_CHANGED, save
 from fusion.state import C_BEND, C_COUNT, C_INTERVAL, C_SAMPLE, C_STATE, Core, Floats
-from fusion.update import age, gives_up, handle
+from fusion.tape import note_coast
+from fusion.update import age, gives_up, handle, move
 from sensors._kernels import radii
 from sensors.kernel import kernel
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
-_GAP_STEP_NS = 50_000_000
+GAP_STEP_NS = 50_000_000
 """A gap is crossed in steps of at most this."""
 Part = tuple[Interval, float, float, float]
 """Part a..b of an interval (0..1) and its length in seconds."""
@@ -78,7 +79,7 @@ def sweep(
         while True:
             now = clock[C_STATE]
             target = ev.t[e] if e < events and ev.t[e] < t else t
-            stop = min(target, now + _GAP_STEP_NS) if gap else target
+            stop = min(target, now + GAP_STEP_NS) if gap else target
             if stop > now:
                 if whole > par.bridge_ns:
                     _coast(core, par, (stop - now) * 1e-9)
@@ -86,8 +87,7 @@ def sweep(
                     part = (interval, (now - start) / whole, (stop - start) / whole, (stop - now) * 1e-9)
                     _advance(nav, earth, acc, span, part, par.layout)
                     if gap:
-                        age(core, span[0])
-                        propagate(nav, earth, core.P, acc, span, (core.phi, core.M, core.Mt), par.noise)
+                        move(core, par)
                         widen(core.P, (stop - now) * 1e-9, par.coast_accel, par.coast_rate)
                 clock[C_STATE] = stop
             if stop == t and not remembered:
@@ -190,7 +190,7 @@ def _remember(core: Core, t: int, w: Vector, f: Vector) -> None:
 @kernel(inline="always")
 def _coast(core: Core, par: Parameters, dt: float) -> None:
     """Bridge a gap in the IMU at constant velocity and attitude, with the covariance widened."""
-    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+    move(core, par)
     nav = core.nav
     meridian, transverse = radii(np.sin(nav[0]))
     nav[1] += nav[3] * dt / ((transverse + nav[2]) * np.cos(nav[0]))
@@ -199,3 +199,5 @@ def _coast(core: Core, par: Parameters, dt: float) -> None:
     refresh(nav, core.earth)
     coast(core.P, dt, par.coast_accel, par.coast_rate)
     age(core, dt)
+    if len(core.tape):
+        note_coast(core, dt)

@@ -9,32 +9,39 @@ import math
 
 from fusion._linalg import Matrix, Vector, cross, matvec
 from fusion.layout import Layout
-from fusion.state import Floats
+from fusion.state import Core, Floats
+from fusion.tape import note_fade
 from sensors.kernel import kernel
 
 
 @kernel(fastmath={"contract"})
-def fade(nav: Floats, P: Floats, first: int, keep: float) -> None:
+def fade(core: Core, first: int, keep: float) -> None:
     """Move three unit Gauss-Markov states on: x' = keep x + sqrt(1 - keep^2) w.
 
     As nothing but its own sensor sees x, this may wait until that measures: the order does not change the result.
     """
+    nav, P = core.nav, core.P
     for k in range(first, first + 3):
         nav[k + 1] *= keep
         for j in range(P.shape[0]):
             P[k, j] *= keep
             P[j, k] *= keep
         P[k, k] += 1.0 - keep * keep
+    if len(core.tape):
+        note_fade(core, first, 3, keep)
 
 
 @kernel()
-def renew(nav: Floats, P: Floats, first: int) -> None:
+def renew(core: Core, first: int) -> None:
     """Three unit Gauss-Markov states of which nothing is known any more."""
+    nav, P = core.nav, core.P
     for k in range(first, first + 3):
         nav[k + 1] = 0.0
         for j in range(P.shape[0]):
             P[k, j] = P[j, k] = 0.0
         P[k, k] = 1.0
+    if len(core.tape):
+        note_fade(core, first, 3, 0.0)
 
 
 @kernel()

@@ -8,6 +8,7 @@ from fusion.events import Parameters
 from fusion.gating import inject
 from fusion.mechanization import refresh
 from fusion.state import C_COUNT, E_WHEEL_SCALE, Core, Floats
+from fusion.tape import note_fade
 from sensors.kernel import kernel
 
 VELOCITY_VAR = 1.0**2
@@ -100,6 +101,8 @@ def start_again(core: Core, par: Parameters, now: int) -> None:
         for j in range(len(dx)):
             if i < E_WHEEL_SCALE or j < E_WHEEL_SCALE:
                 P[i, j] = 0.0
+    if len(core.tape):
+        note_fade(core, 0, E_WHEEL_SCALE, 0.0)
     dx[0], dx[1], dx[2] = doubt[0, 0], doubt[0, 1], doubt[0, 2]
     dx[3], dx[4], dx[5] = doubt[0, 6], doubt[0, 7], -nav[5]
     inject(nav, core.earth, dx)
@@ -114,7 +117,7 @@ def start_again(core: Core, par: Parameters, now: int) -> None:
     P[E_WHEEL_SCALE, E_WHEEL_SCALE] += WHEEL_SCALE_VAR
     for first in (par.layout.gnss_error, par.layout.pose_error):
         if first >= 0:
-            renew(nav, P, first)
+            renew(core, first)
 
 
 @kernel()

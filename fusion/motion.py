@@ -8,6 +8,7 @@ from fusion.gating import correct, innovate, whiten
 from fusion.measurements import body_velocity
 from fusion.result import Sensor
 from fusion.state import C_COUNT, C_TICK, E_WHEEL_SCALE, H_START, RING_SIZE, Core, Floats, Nanoseconds
+from fusion.tape import note_correction
 from sensors._kernels import EARTH_RATE
 from sensors.kernel import kernel
 
@@ -215,3 +216,5 @@ def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
         residual[i] = mean[i] - earth[i] - nav[10 + i]
     if innovate(core.P, core.H, core.W, 3, R, core.L) and whiten(3, residual, core.L) <= par.gate[2]:
         correct(nav, core.earth, core.P, core.W, core.dx, residual, 3)
+        if len(core.tape):
+            note_correction(core, 3)

@@ -5,7 +5,7 @@ Whatever is given in one call or in many, the same operations run in the same or
 
 import numpy as np
 
-from fusion._kernels import process
+from fusion._kernels import GAP_STEP_NS, process
 from fusion.alignment import SERVING, Aligner, Initial
 from fusion.config import FusionConfig
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
@@ -18,6 +18,7 @@ from fusion.result import Decisions, Reason, Restart, States
 from fusion.sources import APPLY, RECORDS, Sources, joined, parts, sources, split
 from fusion.spikes import SpikeGate
 from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, ERROR_SIZE, H_CAUSE, NAV_SIZE, Core, Floats, new_core
+from fusion.tape import Tape, portions
 from fusion.timeline import merge, parameters
 from sensors import pieces
 from sensors.clock import NS_PER_S
@@ -33,14 +34,22 @@ FOREVER, NEVER = 2**63 - 1, -(2**63)
 class Navigator:
     """Measurements wait in ``pending`` until ``advance`` passes them; what was decided is taken out."""
 
-    def __init__(self, vehicle: Vehicle, map_frame: MapFrame | None, config: FusionConfig, kept_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        map_frame: MapFrame | None,
+        config: FusionConfig,
+        kept_s: float = 0.0,
+        tape: Tape | None = None,
+    ) -> None:
         """kept_s: IMU samples before the time that ``advance`` was given are kept so long while not aligned, besides
-        what alignment itself looks back on: only measurements that come late need more."""
+        what alignment itself looks back on: only measurements that come late need more. tape: for the smoother."""
         self._empty = Log(vehicle=vehicle, map_frame=map_frame)
         self._config, self._par = config, parameters(vehicle, config)
         self._priors = prior_variances(vehicle, config)
         self.state_count = used(self._par.layout)
         self._aligner = self._new_aligner()
+        self._tape = tape
         self._kept_ns = round((config.alignment.window_s + kept_s) * NS_PER_S)
         self._rows = dict.fromkeys(RECORDS, 0)
         self._imu: list[Imu] = []
@@ -114,6 +123,8 @@ class Navigator:
     def _give_up(self, core: Core) -> None:
         """Align anew from the state's time on, by whole windows of the IMU."""
         self._restarts.append(Restart(int(core.clock[C_STATE]), int(core.health[H_CAUSE])))
+        if self._tape is not None:
+            self._tape.cut(core)
         self._diverged, self.core, self._aligner = core, None, self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -173,7 +184,7 @@ class Navigator:
         events = timeline.events
         outputs = int((events.kind == OUTPUT).sum())
         recorder = new_recorder(outputs, len(events.t) - outputs)
-        done = feed(core, imu, events, found.measurements, self._par, recorder)
+        done = feed(core, imu, events, found.measurements, self._par, recorder, self._tape)
         if outputs:
             self._states.append(states(recorder))
         if recorder.filled[1]:
@@ -206,11 +217,29 @@ def start(initial: Initial, imu: Imu, priors: Floats | None = None) -> Core:
     return core
 
 
-def feed(core: Core, imu: Imu, events: Events, measurements: Measurements, par: Parameters, rec: Recorder) -> int:
+def feed(
+    core: Core,
+    imu: Imu,
+    events: Events,
+    measurements: Measurements,
+    par: Parameters,
+    rec: Recorder,
+    tape: Tape | None = None,
+) -> int:
     """Run the kernel over an IMU record and all events up to its last sample; the first event not reached.
 
-    Every column goes in read-only and contiguous: one compiled kernel serves every log, whatever its sensors.
+    Every column goes in read-only and contiguous: one compiled kernel serves every log, whatever its sensors. With a
+    tape it goes by portions, which changes nothing but the memory that the tape needs.
     """
     columns = Measurements(*(read_only(column) for column in measurements))
-    samples = read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel)
-    return int(process(core, *samples, events, 0, columns, par, rec))
+    t, gyro, accel = read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel)
+    if tape is None:
+        return int(process(core, t, gyro, accel, events, 0, columns, par, rec))
+    first = 0
+    for part, numbers in list(portions(core, t, events.t, par, GAP_STEP_NS)):
+        threaded, before = tape.threaded(core, numbers), int(rec.filled[0])
+        first = int(process(threaded, t[part], gyro[part], accel[part], events, first, columns, par, rec))
+        tape.keep(threaded, int(rec.filled[0]) - before)
+        if first < len(events.t) and events.t[first] <= t[part][-1]:  # the state was given up
+            break
+    return first

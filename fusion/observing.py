@@ -76,9 +76,9 @@ def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rat
     if lasts:
         stated = core.R[0, 0] + core.R[1, 1]
         if 0.25 * core.aged[2] <= stated <= 4.0 * core.aged[2]:
-            fade(nav, core.P, layout.gnss_error, math.exp(-par.gnss_rate * core.aged[0]))
+            fade(core, layout.gnss_error, math.exp(-par.gnss_rate * core.aged[0]))
         else:  # another kind of solution, with errors of its own
-            renew(nav, core.P, layout.gnss_error)
+            renew(core, layout.gnss_error)
         core.aged[0], core.aged[2] = 0.0, stated
         lasting(nav, H, core.R, core.residual, core.L, layout.gnss_error, par.gnss_shares[1])
     scale(core.R, par.gnss_shares[0] + (0.0 if lasts else par.gnss_shares[1]))
@@ -131,7 +131,7 @@ def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float, las
     if layout.pose_error < 0:
         return
     if lasts:
-        fade(nav, core.P, layout.pose_error, math.exp(-par.pose_per_m * core.aged[1]))
+        fade(core, layout.pose_error, math.exp(-par.pose_per_m * core.aged[1]))
         core.aged[1] = 0.0
         lasting(nav, H, core.R, residual, core.L, layout.pose_error, par.pose_shares[1])
     scale(core.R, par.pose_shares[0] + (0.0 if lasts else par.pose_shares[1]))

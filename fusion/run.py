@@ -8,6 +8,7 @@ from fusion.recording import join
 from fusion.result import FusionResult, Reason
 from fusion.rewinding import RewindingNavigator
 from fusion.sources import RECORDS
+from fusion.tape import Tape
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
@@ -27,10 +28,21 @@ class Session:
     memory is the last piece, and measurements since the last IMU sample.
     """
 
-    def __init__(self, vehicle: Vehicle, map_frame: MapFrame | None = None, config: FusionConfig | None = None) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        map_frame: MapFrame | None = None,
+        config: FusionConfig | None = None,
+        tape: Tape | None = None,
+    ) -> None:
+        """tape: takes down what ``fusion.smoother`` needs."""
         self._config = config or FusionConfig()
-        kind = RewindingNavigator if self._config.order == "arrival" else Navigator
-        self._navigator: Navigator = kind(vehicle, map_frame, self._config)
+        if self._config.order == "arrival":
+            if tape is not None:
+                raise EgolocError('fusion.order: expected "stamp" to smooth a drive, got "arrival"')
+            self._navigator: Navigator = RewindingNavigator(vehicle, map_frame, self._config)
+        else:
+            self._navigator = Navigator(vehicle, map_frame, self._config, tape=tape)
         self._held_ns = max(0, *(round(s * 1e9) for s in (vehicle.gnss_delay_s, vehicle.gnss_velocity_delay_s)))
         self._samples = 0
 

@@ -15,7 +15,7 @@ SPACING_NS = 8_000_000
 """Snapshots are taken at IMU samples, so far apart or more."""
 IMU_HZ = 1000
 """Up to this rate of the IMU the history is as long as it is configured; beyond it is shorter."""
-_SCRATCH = ("phi", "M", "Mt", "H", "W", "R", "L", "eigen", "residual", "dx")
+_SCRATCH = ("phi", "M", "Mt", "H", "W", "R", "L", "eigen", "residual", "dx", "turned", "tape", "tape_end")
 _SNAPSHOTS = ("kept", "saved", "saved_cov", "saved_t", "saves")
 _ELSEWHERE = {"P", "ring", "ring_t", *_SCRATCH, *_SNAPSHOTS}
 """Arrays that are not in ``kept``: P, scratch, and the ring, whose samples are put there again."""

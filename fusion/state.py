@@ -99,6 +99,7 @@ class Core(NamedTuple):
     health (11,), trust (5, 3) int64: clocks of ``fusion.health`` (H_*, T_*).
     phi (9, 16), M (9, n), Mt (16, 16), H, W (3, n), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (n,): scratch.
+    turned (3, 3): A_T of the last transition; tape (K,), tape_end (1,): what ``fusion.tape`` puts down; K = 0: nothing.
     rate (3,): the body rate before the last sample, as events at its time saw it, rad/s.
     kept (K,), saved (S, K), saved_cov (S, n, n), saved_t (S, 2), saves (4,): ``fusion.snapshots``; S = 0: none.
     """
@@ -130,6 +131,9 @@ class Core(NamedTuple):
     eigen: Floats
     residual: Floats
     dx: Floats
+    turned: Floats
+    tape: Floats
+    tape_end: Nanoseconds
     rate: Floats
     kept: Nanoseconds
     saved: Nanoseconds
@@ -168,6 +172,9 @@ def new_core(size: int = ERROR_SIZE) -> Core:
         eigen=np.zeros((2, 3, 3)),
         residual=np.zeros(3),
         dx=np.zeros(size),
+        turned=np.zeros((3, 3)),
+        tape=np.empty(0),
+        tape_end=np.zeros(1, np.int64),
         rate=np.zeros(3),
         kept=np.zeros(0, np.int64),
         saved=np.zeros((0, 0), np.int64),

@@ -16,8 +16,9 @@ from fusion.observing import measure, triple
 from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
 from fusion.robust import reweigh
-from fusion.state import H_CAUSE, H_STATE, ROW, Core
+from fusion.state import A_T, H_CAUSE, H_STATE, ROW, Core
 from fusion.streak import tally, threshold_of
+from fusion.tape import note_correction, note_move, note_state
 from sensors.kernel import kernel
 
 _GNSS_POSITION = int(Sensor.GNSS_POSITION)
@@ -49,11 +50,12 @@ def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Even
     if ev.verdict[e] >= 0:
         record_decision(rec, e, kind, 0, ev.verdict[e])
         return
-    if core.P.shape[0] > ROW:
-        age(core, core.span[0])
-    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+    move(core, par)
     if kind == OUTPUT:
-        record_state(core, rec, par, ev.t[e])
+        _record_health(core, rec, par, ev.t[e])
+        record_state(core, rec, ev.t[e])
+        if len(core.tape):
+            note_state(core, ev.t[e])
         return
     accepted = _ACCEPTED
     if kind == MOTION:
@@ -105,7 +107,7 @@ def _apply_position(
         dof, accepted = measure(core, par, m, kind, ev.row[e], rate, False)
         known = innovate(core.P, core.H, core.W, dof, core.R, core.L)
         if known and whiten(dof, core.residual, core.L) <= threshold:
-            renew(core.nav, core.P, first)
+            renew(core, first)
             dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
             passed = _apply(core, rec, par, k, dof, threshold, accepted)
     if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
@@ -145,6 +147,8 @@ def _apply(core: Core, rec: Recorder, par: Parameters, k: int, dof: int, thresho
             core.P, core.H, core.W, dof, core.R, L, residual, rec.innovation, k, par.robust, par.robust_sigmas, core.dx
         )  # fmt: skip
     correct(core.nav, core.earth, core.P, core.W, core.dx, residual, dof)
+    if len(core.tape):
+        note_correction(core, dof)
     dx = core.dx
     rec.reason[k] = accepted
     rec.scores[k, 2] = np.sqrt(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2)
@@ -167,8 +171,18 @@ def record_decision(rec: Recorder, event: int, sensor: int, dof: int, reason: in
 
 
 @kernel(inline="always")
-def record_state(core: Core, rec: Recorder, par: Parameters, t: int) -> None:
-    """Record nav, the pose covariance (position, attitude), every sigma, and how the filter is doing."""
+def _record_health(core: Core, rec: Recorder, par: Parameters, t: int) -> None:
+    """Record how the filter is doing, into the row of the state that is recorded next."""
+    k = rec.filled[0]
+    judge(core, par.health, t)
+    rec.health[k, 0], rec.health[k, 1] = core.health[H_STATE], core.health[H_CAUSE]
+    for sensor in range(_SOURCES):
+        rec.levels[k, sensor] = level_of(core.trust, par.health.stale_ns[sensor], par.health.suspect, sensor, t)
+
+
+@kernel(inline="always")
+def record_state(core: Core, rec: Recorder, t: int) -> None:
+    """Record nav, the pose covariance (position, attitude) and every sigma."""
     P = core.P
     k = rec.filled[0]
     rec.filled[0] = k + 1
@@ -182,10 +196,24 @@ def record_state(core: Core, rec: Recorder, par: Parameters, t: int) -> None:
         for j in range(6):
             b = j if j < 3 else j + 3
             rec.pose_cov[k, i, j] = P[a, b]
-    judge(core, par.health, t)
-    rec.health[k, 0], rec.health[k, 1] = core.health[H_STATE], core.health[H_CAUSE]
-    for sensor in range(_SOURCES):
-        rec.levels[k, sensor] = level_of(core.trust, par.health.stale_ns[sensor], par.health.suspect, sensor, t)
+
+
+@kernel(inline="always")
+def move(core: Core, par: Parameters) -> None:
+    """Bring P up to the state's time."""
+    span = core.span[0]
+    if span == 0.0:
+        return
+    if core.P.shape[0] > ROW:
+        age(core, span)
+    taped = len(core.tape) > 0
+    if taped:
+        for i in range(3):
+            for j in range(3):
+                core.turned[i, j] = core.acc[A_T + i, j]
+    propagate(core.nav, core.earth, core.P, core.acc, core.span, (core.phi, core.M, core.Mt), par.noise)
+    if taped:
+        note_move(core, par.layout)
 
 
 @kernel(inline="always")

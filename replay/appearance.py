@@ -25,14 +25,26 @@ HEALTH = ("initializing", "healthy", "degraded", "dead reckoning", "diverged", "
 HEALTH_COLOURS = dict(
     zip(HEALTH, (0x5B5F66FF, 0x3F8A48FF, 0xBFAE35FF, 0xC77F2CFF, 0xC0453CFF, 0x3B6FB5FF), strict=True)
 )
-WIDTHS = (4.0, 2.8, 1.8, 0.8)
+WIDTHS = (4.0, 2.8, 1.8, 1.2, 0.8)
 """Of the tracks, in the palettes' order, screen points."""
 HIDDEN_COLOURS = {"hidden on purpose": 0x5A4E8CFF}
 REJECTED: Colour = (240, 70, 60)
 LIMIT: Colour = (200, 60, 60)
 PALETTES: Sequence[Mapping[str, Colour]] = (
-    {"reference": (170, 170, 170), "GNSS": (240, 145, 40), "EgoVM": (80, 180, 95), "fused": (85, 145, 255)},
-    {"reference": (120, 120, 120), "GNSS": (165, 95, 25), "EgoVM": (40, 120, 65), "fused": (235, 85, 195)},
+    {
+        "reference": (170, 170, 170),
+        "GNSS": (240, 145, 40),
+        "EgoVM": (80, 180, 95),
+        "smoothed": (90, 215, 225),
+        "fused": (85, 145, 255),
+    },
+    {
+        "reference": (120, 120, 120),
+        "GNSS": (165, 95, 25),
+        "EgoVM": (40, 120, 65),
+        "smoothed": (40, 140, 150),
+        "fused": (235, 85, 195),
+    },
 )
 XYZ: Sequence[Sequence[Colour]] = (
     ((230, 95, 85), (95, 190, 100), (85, 145, 255)),

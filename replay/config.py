@@ -60,6 +60,8 @@ class RunConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limits: Limits = Limits()
     """In TOML a table or a profile: paper, highway, local-street."""
     hide_gnss: HideGnss | None = None
+    smooth: bool = False
+    """Smooth the drive as well, backwards from its end: smoothed.parquet."""
     inject: tuple[str, ...] = ()
     """Faults put into every log: NAME[:SEVERITY][@BEGIN[+LENGTH]], s since the first IMU sample (docs/faults.md)."""
     seed: int = 0

@@ -87,14 +87,17 @@ def draw_tracks(canvas: Canvas, run: RunColumns, place: MapPlace, style: Style) 
             points = place.points(fixes["x"], fixes["y"], 2e-3)
             dots = rr.Points3D(points[np.isfinite(points).all(axis=1)], colors=[style.palette[name]], radii=0.02)
             canvas.still(f"near/fixes/{name}", dots)
+    if run.smoothed is not None:
+        smoothed = _thinned_states(run.smoothed)
+        _track(canvas, "smoothed", smoothed["t_ns"], smoothed["x"], smoothed["y"], style.palette, place)
     _track(canvas, "fused", t, columns["x"], columns["y"], style.palette, place)
     for view in ("far", "near"):
-        places = place.points(columns["x"], columns["y"], 4 * place.layer[view])
+        places = place.points(columns["x"], columns["y"], len(style.palette) * place.layer[view])
         canvas.vehicle(f"{view}/vehicle", t, places, style.palette["fused"], style.label.strip() or "fused")
 
 
 def draw_errors(canvas: Canvas, run: RunColumns, style: Style) -> None:
-    """Errors of the fused pose within its 1 and 3 sigma, and of the sensors at their own stamps."""
+    """Errors of the fused pose within its 1 and 3 sigma, of the smoothed one, of the sensors at their own stamps."""
     rows = thin(run.states["t_ns"])
     t = run.states["t_ns"][rows]
     for axis in AXES:
@@ -107,6 +110,10 @@ def draw_errors(canvas: Canvas, run: RunColumns, style: Style) -> None:
                 canvas.line(path, fixes["t_ns"], values, words, colour, 1.0, shown=style.alone)
         canvas.band(f"error/{axis}/sigma_3", t, 3.0 * sigma, f"3 sigma{style.label}", style.palette["fused"])
         canvas.band(f"error/{axis}/sigma", t, sigma, f"1 sigma{style.label}", style.palette["fused"])
+        if run.smoothed is not None:
+            smoothed = _thinned_states(run.smoothed)
+            values, colour = SCALE[axis] * smoothed[f"err_{axis}"], style.palette["smoothed"]
+            canvas.line(f"error/{axis}/smoothed", smoothed["t_ns"], values, f"smoothed{style.label}", colour)
         # lines lie on each other in alphabetical order of their paths: this one on top
         canvas.line(f"error/{axis}/solution", t, error, f"fused{style.label}", style.palette["fused"])
 
@@ -185,6 +192,11 @@ def _by_fate(
 ) -> None:
     canvas.marks(f"{path}/accepted", t_ns[passed], values[passed], f"accepted{label}", colour)
     canvas.marks(f"{path}/rejected", t_ns[~passed], values[~passed], f"left out{label}", REJECTED, 2.5)
+
+
+def _thinned_states(rows: Columns) -> dict[str, NDArray[Any]]:
+    kept = thin(rows["t_ns"])
+    return {name: column[kept] for name, column in rows.items()}
 
 
 def _thinned(rows: Columns) -> dict[str, NDArray[Any]]:

@@ -9,18 +9,21 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fusion.result import FusionResult
+from fusion.result import FusionResult, States
 from fusion.run import Session
 from replay.config import RunConfig
 from replay.evaluation import Batch, Evaluation
 from replay.plausibility import FASTEST_SPEED, Watch
+from replay.references import Samples
 from replay.requirements import Contents, check_replayable
 from replay.run_files import Facts
+from replay.smoothing import Columns, Smoothing
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame, utm_frame
 from sensors.records import LeftOut, Log, Trajectory
 from sensors.simulate.faults.spec import Injection
+from sensors.vehicle import Vehicle
 
 
 class Drive:
@@ -28,9 +31,9 @@ class Drive:
 
     first: the first piece, which tells vehicle and map frame where the config does not; where: how messages about the
     drive begin; reference_file: a trajectory instead of the drive's reference; faults: what was put into the pieces;
-    all_columns: of decisions, not only those that scoring reads. config: with the vehicle and the map frame in use (a
-    drive without one takes the UTM frame of its first fix, unless it holds map coordinates); km: how far the filter has
-    driven.
+    all_columns: of decisions, not only those that scoring reads; scratch: folder for what is kept in files until the
+    drive is smoothed. config: with the vehicle and the map frame in use (a drive without one takes the UTM frame of its
+    first fix, unless it holds map coordinates); km: how far the filter has driven.
     """
 
     def __init__(
@@ -42,17 +45,20 @@ class Drive:
         faults: Sequence[Injection] = (),
         *,
         all_columns: bool = True,
+        scratch: Path | None = None,
     ) -> None:
         vehicle, frame = config.vehicle or first.vehicle, config.map_frame or first.map_frame
         self._trajectory: Trajectory | None = None
         if reference_file is not None:
-            self._trajectory, frame = read_reference(reference_file, frame)
+            self._trajectory, frame = read_reference(reference_file, frame, vehicle)
         self._source = "log" if reference_file is None else reference_file.name
         self.config = msgspec.structs.replace(config, vehicle=vehicle, map_frame=frame)
         self.period_ns, self.km = round(NS_PER_S / config.fusion.output_hz), 0.0
         self._vehicle, self._where, self._faults = vehicle, where, faults
         with self._named():
-            self._session = Session(vehicle, frame, config.fusion)
+            self._smoothing = Smoothing(scratch) if config.smooth else None
+            tape = None if self._smoothing is None else self._smoothing.tape
+            self._session = Session(vehicle, frame, config.fusion, tape)
             self._evaluation = Evaluation(vehicle, config, self._trajectory, all_columns=all_columns)
         self._watch, self._contents = Watch(land_vehicle=vehicle.land_vehicle), Contents()
         self._left_out, self._noted = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
@@ -66,7 +72,7 @@ class Drive:
             given = self._evaluation.given(self._placed(piece))
             result = self._session.push(given)
             self._see(given, result)
-            return self._evaluation.add(given, result)
+            return self._noticed(self._evaluation.add(given, result))
 
     def finish(self) -> Batch:
         """The rest. Raises EgolocError where the drive lacked what a replay needs."""
@@ -74,7 +80,21 @@ class Drive:
             check_replayable(self._contents, _entries(self._left_out))
             result = self._session.finish()
             self._see(Log(), result)
-            return self._evaluation.finish(result)
+            return self._noticed(self._evaluation.finish(result))
+
+    def smoothed(self) -> Iterator[Columns]:
+        """Rows of the smoothed states after the end, in the order of time; none where it is not smoothed."""
+
+        def compare(states: States, samples: Samples) -> Columns:
+            with self._named():
+                return self._evaluation.compared(states, samples)
+
+        return iter(()) if self._smoothing is None else self._smoothing.rows(compare)
+
+    def _noticed(self, batch: Batch) -> Batch:
+        if self._smoothing is not None:
+            self._smoothing.add(batch)
+        return batch
 
     @property
     def start_ns(self) -> int | None:
@@ -100,6 +120,7 @@ class Drive:
                 {"source": entry.source, "reason": entry.reason, "count": entry.count}
                 for entry in (*_entries(self._left_out), *_entries(self._noted))
             ],
+            "smoothed": self._smoothing is not None,
         }
 
     def _placed(self, piece: Log) -> Log:
@@ -136,10 +157,16 @@ def injected(faults: Sequence[Injection]) -> Iterator[dict[str, str]]:
         yield {"kind": "injected", "text": f"Fault injected, {span}: {one.fault.name}: {one.told}."}
 
 
-def read_reference(path: Path, frame: MapFrame | None) -> tuple[Trajectory, MapFrame | None]:
-    """A trajectory file in a frame or, where none is known, in that of the file."""
+def read_reference(path: Path, frame: MapFrame | None, vehicle: Vehicle) -> tuple[Trajectory, MapFrame | None]:
+    """A trajectory file in a frame or, where none is known, in that of the file.
+
+    It tells of the vehicle's reference point, but for the states of a run, which are of the body and brought there.
+    """
+    from sensors.datasets.run_trajectory import is_parquet, read_run_trajectory
     from sensors.datasets.trajectory_file import read_trajectory
 
+    if is_parquet(path):
+        return read_run_trajectory(path, frame, vehicle.reference_lever_arm)
     return read_trajectory(path, frame)
 
 

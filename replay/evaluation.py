@@ -15,7 +15,7 @@ from fusion.result import Decisions, FusionResult, Sensor, States
 from replay.config import RunConfig
 from replay.decisions import FIXES, Fixes, decision_columns, gnss_columns, pose_columns
 from replay.hiding import Hider
-from replay.references import FOREVER_NS, LATE_NS, Excluded, Track
+from replay.references import FOREVER_NS, LATE_NS, Excluded, Samples, Track
 from replay.run_files import ReferenceFacts
 from replay.states import state_columns
 from replay.tags import TagTrack
@@ -33,13 +33,15 @@ Record = TypeVar("Record", States, Decisions)
 class Batch:
     """Rows of both tables that follow those of the batch before, each in the order of its table.
 
-    states, decisions: their columns, with `scene` and `mode` as int16 codes into scenes and modes, which only grow.
+    states, decisions: their columns, with `scene` and `mode` as int16 codes into scenes and modes, which only grow;
+    samples: the reference at the rows of states, as they are compared with it (None: read from a run's tables).
     """
 
     states: Columns
     decisions: Columns
     scenes: tuple[str, ...]
     modes: tuple[str, ...]
+    samples: Samples | None = None
 
 
 class Evaluation:
@@ -142,36 +144,42 @@ class Evaluation:
     def _take(self, until_ns: int) -> Batch:
         """The rows up to a time that have not been taken."""
         since, until = self._done_ns, max(until_ns, self._done_ns)
-        states, self._states = _split(self._states, until)
-        decisions, self._decisions = _split(self._decisions, until)
+        states, self._states = split_at(self._states, until)
+        decisions, self._decisions = split_at(self._decisions, until)
+        samples = self._epochs(states, since, until)
         batch = Batch(
-            self._state_rows(states, since, until),
+            self.compared(states, samples) | self._tags(samples.t_ns),
             self._decision_rows(decisions),
             tuple(self._scenes.texts),
             tuple(self._modes.texts),
+            samples,
         )
         self._done_ns = until
         for kept in (self._track, self._scenes, self._modes):
             kept.forget(until - LATE_NS)
         return batch
 
-    def _state_rows(self, states: States, since_ns: int, until_ns: int) -> Columns:
-        """One row per state, and per epoch of the output grid that has a reference but no state."""
-        missing = self._epochs_without_state(states.t_ns, since_ns, until_ns)
-        if len(missing):
-            missing = missing[self._track.sample(missing).excluded != Excluded.OUTSIDE]
-        t_ns = np.sort(np.concatenate((states.t_ns, missing)), kind="stable") if len(missing) else states.t_ns
+    def compared(self, states: States, samples: Samples) -> Columns:
+        """One row per epoch: states, which may lack at some of them, beside the reference there."""
+        has_state = np.isin(samples.t_ns, states.t_ns, assume_unique=True)
         judged = self._track.judged
-        columns = state_columns(
+        return state_columns(
             states,
-            missing,
+            samples.t_ns[~has_state],
             self._frame or MapFrame("enu"),  # without a frame there are no states
-            self._track.sample(t_ns),
+            samples,
             self._point,
             FOREVER_NS if judged is None else judged.first_ns,
             None if self._hider is None else self._hider.stretches(),
         )
-        return columns | self._tags(t_ns)
+
+    def _epochs(self, states: States, since_ns: int, until_ns: int) -> Samples:
+        """The reference at every state, and at every epoch of the output grid where there is one but no state."""
+        missing = self._epochs_without_state(states.t_ns, since_ns, until_ns)
+        if len(missing):
+            missing = missing[self._track.sample(missing).excluded != Excluded.OUTSIDE]
+        t_ns = np.sort(np.concatenate((states.t_ns, missing)), kind="stable") if len(missing) else states.t_ns
+        return self._track.sample(t_ns)
 
     def _epochs_without_state(self, known: Nanoseconds, since_ns: int, until_ns: int) -> Nanoseconds:
         """Stamps of the output grid since a time and up to another, within the IMU's, without a state."""
@@ -210,8 +218,8 @@ class Evaluation:
         return {"scene": self._scenes.at(t_ns), "mode": self._modes.at(t_ns)}
 
 
-def _split(parts: list[Record], until_ns: int) -> tuple[Record, list[Record]]:
-    """The rows before the first that is later than a time, and the others."""
+def split_at(parts: list[Record], until_ns: int) -> tuple[Record, list[Record]]:
+    """The rows of parts (one or more) before the first that is later than a time, and the others."""
     whole = join(parts)
     later = whole.t_ns > until_ns
     count = int(np.argmax(later)) if later.any() else len(later)

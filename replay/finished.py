@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from replay.batch import Job
-from replay.config import Limits, load_config
+from replay.config import RunConfig, load_config
 from replay.run_files import EXPECTED, read_json
 from replay.sources import LogSource
 from replay.store import file_hash, versions
@@ -20,7 +20,7 @@ def why_not_finished(folder: Path, source: LogSource, job: Job) -> str | None:
     Read back: manifest, configuration, metrics and sums; of the tables only how many rows they hold.
     """
     try:
-        return _difference(folder, source, job) or _damage(folder, job.config.limits)
+        return _difference(folder, source, job) or _damage(folder, job.config)
     except (EgolocError, OSError) as error:
         return str(error)
 
@@ -48,15 +48,15 @@ def _difference(folder: Path, source: LogSource, job: Job) -> str | None:
     return f"{folder}: a run with other {', '.join(other)}" if other else None
 
 
-def _damage(folder: Path, limits: Limits) -> str | None:
+def _damage(folder: Path, config: RunConfig) -> str | None:
     """What cannot be read of the run, or was changed since."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     read_json(folder / "metrics.json")
-    if Sums.from_parquet(folder).counts.limits != limits:
+    if Sums.from_parquet(folder).counts.limits != config.limits:
         return f"{folder}: scored again with other limits"
-    for name in ("states.parquet", "decisions.parquet"):
+    for name in ("states.parquet", "decisions.parquet", *(["smoothed.parquet"] if config.smooth else [])):
         if not (folder / name).is_file():
             return f"{folder / name}: missing: {EXPECTED}"
         try:

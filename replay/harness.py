@@ -17,7 +17,7 @@ from replay.run_files import read_json
 from replay.scoring import Scorer
 from replay.sources import LogSource
 from replay.store import Keep, check_free, file_hash, load_facts, new_folder, storage, versions, write_json
-from replay.tables import Tables, stored_batches
+from replay.tables import Tables, stored_batches, stored_smoothed
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
 from sensors.records import Log
@@ -56,7 +56,7 @@ def replay_source(
     with ThreadPoolExecutor(1) as pool:
         log = pool.submit(source.facts)
         with new_folder(out, overwrite=overwrite) as folder, Tables(folder, source.name, keep) as tables:
-            drive, sums = _stream(source, config, reference_file, tables, progress)
+            drive, sums = _stream(source, config, reference_file, tables, folder, progress)
             metrics = metrics_of(sums)
             manifest = {
                 "name": source.name,
@@ -78,13 +78,19 @@ def replay_source(
 
 
 def _stream(
-    source: LogSource, config: RunConfig, reference_file: Path | None, tables: Tables, progress: Progress | None
+    source: LogSource,
+    config: RunConfig,
+    reference_file: Path | None,
+    tables: Tables,
+    scratch: Path,
+    progress: Progress | None,
 ) -> tuple[Drive, "Sums"]:
-    """Every piece through the filter into the tables; the drive at its end, and its sums."""
+    """Every piece through the filter into the tables, and smoothed at the end; the drive then, and its sums."""
     injector = Injector(parse_faults(config.inject), config.seed, f"{source.where}: --inject")
     pieces = injector.pieces(_pieces(source, config))
     first = next(pieces, Log())
-    drive = Drive(first, config, source.where, reference_file, injector.injections, all_columns=tables.holds_decisions)
+    columns = {"all_columns": tables.holds_decisions}
+    drive = Drive(first, config, source.where, reference_file, injector.injections, scratch=scratch, **columns)
     scorer: Scorer | None = None
     for piece in chain((first,), pieces, (None,)):
         batch = drive.finish() if piece is None else drive.push(piece)
@@ -96,6 +102,9 @@ def _stream(
         if progress is not None:
             progress(drive.km)
     assert scorer is not None  # a drive without IMU does not come so far
+    for rows in drive.smoothed():
+        scorer.add_smoothed(rows)
+        tables.add_smoothed(rows, batch, drive.config.map_frame)
     return drive, scorer.finish(drive.facts(), batch.scenes, batch.modes)
 
 
@@ -109,7 +118,7 @@ def _pieces(source: LogSource, config: RunConfig) -> Iterator[Log]:
 
 def with_reference(log: Log, path: Path, frame: MapFrame | None) -> Log:
     """The log with a trajectory file as its reference, in a frame or, where none is known, in that of the file."""
-    trajectory, placed = read_reference(path, frame)
+    trajectory, placed = read_reference(path, frame, log.vehicle)
     return replace(log, reference=trajectory, map_frame=placed)
 
 
@@ -120,6 +129,8 @@ def score_run(folder: Path, limits: Limits) -> Metrics:
     scorer = Scorer(limits, log=name, period_ns=facts["period_ns"], start_ns=facts["start_ns"])
     for batch in stored_batches(folder):
         scorer.add(batch.states, batch.decisions)
+    for rows in stored_smoothed(folder) if facts.get("smoothed") else ():
+        scorer.add_smoothed(rows)
     sums = scorer.finish(facts, batch.scenes, batch.modes)
     metrics = metrics_of(sums)
     with storage(folder):

@@ -1,7 +1,7 @@
 """The contents of metrics.json, of a log or a campaign, from its sums (docs/metrics.md)."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -108,7 +108,8 @@ def methods_of(counts: Counts) -> list[str]:
     present = {name for name, sensor in SENSORS.items() if sensor.name.lower() in counts.decisions}
     if counts.hidden_length_s is not None:
         present.discard("gnss")  # it is the reference
-    return [name for name in METHODS if name in present or name == "fusion"]
+    present |= {"fusion", "smoothed"} if counts.smoothed else {"fusion"}
+    return [name for name in METHODS if name in present]
 
 
 def method_metrics(rows: Segments, sketch: Sketch, method: str, least_ns: float = 1) -> Metrics:
@@ -146,7 +147,7 @@ def _axis_metrics(rows: Segments, sketch: Sketch, method: str, axis: str) -> Met
 
 
 def _hidden(counts: Counts) -> Metrics:
-    """How far the filter had drifted at the end of every stretch without GNSS."""
+    """How far the filter had drifted at the end of every stretch without GNSS, and at worst within it."""
     ends = [stretch for stretch in counts.stretches if stretch["end_horizontal_m"] is not None]
     error = np.array([stretch["end_horizontal_m"] for stretch in ends])
     ratio = [stretch["end_horizontal_m"] / stretch["end_sigma_m"] for stretch in ends]
@@ -156,8 +157,22 @@ def _hidden(counts: Counts) -> Metrics:
         "length_s": counts.hidden_length_s,
         "end_horizontal_m": {"p50": p50, "p95": p95, "max": float(error.max()) if ends else None},
         "end_error_over_sigma_rms": math.sqrt(math.fsum(r * r for r in ratio) / len(ends)) if ends else None,
+        **_within([stretch.get("within") for stretch in counts.stretches]),
+        **({"smoothed": _within([stretch.get("smoothed") for stretch in counts.stretches])} if counts.smoothed else {}),
         "without_end": len(counts.stretches) - len(ends),
         "per_stretch": counts.stretches,
+    }
+
+
+def _within(stretches: Sequence[Metrics | None]) -> Metrics:
+    """The largest errors within stretches, and the rms of their ratios of error to sigma."""
+    known = [stretch for stretch in stretches if stretch is not None]
+    largest = np.array([stretch["largest_horizontal_m"] for stretch in known])
+    squares = [stretch["error_over_sigma_rms"] ** 2 for stretch in known]
+    p50, p95 = np.percentile(largest, (50, 95)).tolist() if known else (None, None)
+    return {
+        "largest_horizontal_m": {"p50": p50, "p95": p95, "max": float(largest.max()) if known else None},
+        "error_over_sigma_rms": math.sqrt(math.fsum(squares) / len(known)) if known else None,
     }
 
 

@@ -26,6 +26,7 @@ STATES = (
     *(f"{kind}_bias_{axis}" for kind in ("gyro", "accel") for axis in "xyz"),
     *(f"{kind}_{axis}" for kind in ("err", "sigma") for axis in AXES),
 )
+SMOOTHED = ("t_ns", "x", "y", *(f"err_{axis}" for axis in AXES))
 DECISIONS = (
     *("t_ns", "sensor", "reason", "accepted", "nis", "threshold", "x", "y", "status"),
     *(f"innovation_{i}" for i in range(3)),
@@ -39,7 +40,8 @@ class RunColumns:
     """One run.
 
     states: STATES, each (N,), "health" as codes of Health; sensors: name -> DECISIONS without "sensor", each (M,),
-    "reason" as codes into `reasons`; metrics, manifest, config: the files as they stand.
+    "reason" as codes into `reasons`; metrics, manifest, config: the files as they stand; smoothed: SMOOTHED, None where
+    the run was not.
     """
 
     name: str
@@ -49,6 +51,7 @@ class RunColumns:
     metrics: Mapping[str, Any]
     manifest: Mapping[str, Any]
     config: Mapping[str, Any]
+    smoothed: Columns | None = None
 
     def code(self, reason: str) -> int:
         """The code of a reason; -1 where no row of the run has it."""
@@ -65,6 +68,8 @@ def load_columns(run: Path) -> RunColumns:
     if not run.is_dir():
         raise EgolocError(f"{run}: {EXPECTED}")
     states = read_table(run / "states.parquet", STATES)
+    has_smoothed = (run / "smoothed.parquet").is_file()
+    smoothed = read_table(run / "smoothed.parquet", SMOOTHED) if has_smoothed else None
     decisions = read_table(run / "decisions.parquet", DECISIONS)
     sensor, sensor_names = _codes(decisions["sensor"])
     reason, reasons = _codes(decisions["reason"])
@@ -84,6 +89,7 @@ def load_columns(run: Path) -> RunColumns:
         metrics=_read_checked(run / "metrics.json", SeenMetrics),
         manifest=_read_checked(run / "manifest.json", SeenManifest),
         config=_read_toml(run / "config.toml"),
+        smoothed=None if smoothed is None else {name: _array(smoothed[name]) for name in SMOOTHED},
     )
 
 

@@ -54,6 +54,7 @@ class Facts(TypedDict):
     health: dict[str, int]
     warnings: list[dict[str, str]]
     left_out: list[dict[str, str | int]]
+    smoothed: NotRequired[bool]
 
 
 class Manifest(TypedDict):

@@ -7,8 +7,8 @@ import numpy as np
 
 from replay.run_columns import RunColumns
 
-COLOURS = "Reference grey, GNSS orange, EgoVM green, fused blue; bands: 1 and 3 sigma of the fused pose."
-METHODS = {"gnss": "GNSS", "egovm": "EgoVM", "fusion": "fusion"}
+COLOURS = "Reference grey, GNSS orange, EgoVM green, smoothed cyan, fused blue; bands: 1 and 3 sigma of the fused pose."
+METHODS = {"gnss": "GNSS", "egovm": "EgoVM", "fusion": "fusion", "smoothed": "smoothed"}
 
 
 def summary(runs: Sequence[RunColumns]) -> str:

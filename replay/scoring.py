@@ -56,6 +56,7 @@ class Scorer:
         self._grid = Outputs(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
         self._speed = np.empty(0)
         self._before_ns: int | None = None
+        self._smoothed_ns: int | None = None
         self._seen_ns = -(2**62)
         self._rows = 0
         self._excluded = dict.fromkeys((*(why.name.lower() for why in Excluded), "position_sigma", "yaw_sigma"), 0)
@@ -74,6 +75,18 @@ class Scorer:
         needed = min(waiting.needs_after_ns(self._seen_ns - HOLD_NS) for waiting in self._waiting.values())
         self._grid, self._speed = _rows(self._grid, self._grid.t_ns > needed), self._speed[self._grid.t_ns > needed]
 
+    def add_smoothed(self, states: Columns) -> None:
+        """The next rows of smoothed states, at the epochs of the filter's; these may all have been added before."""
+        t_ns = states["t_ns"]
+        if not len(t_ns):
+            return
+        position, yaw = self._well_known(states)
+        evaluated = (states["excluded"] == Excluded.EVALUATED) & position & yaw
+        outputs, grid, speed = self._epochs(states, evaluated, self._smoothed_ns)
+        self._cells.add_outputs("smoothed", outputs, grid, speed)
+        self._stretches.add_smoothed(states)
+        self._smoothed_ns = int(t_ns[-1])
+
     def finish(self, facts: Facts, scenes: Sequence[str] = ("",), modes: Sequence[str] = ("",)) -> Sums:
         """The sums of the whole drive. scenes, modes: the texts of the codes."""
         self._sum_fixes(None)
@@ -88,19 +101,26 @@ class Scorer:
         t_ns = states["t_ns"]
         if not len(t_ns):
             return
-        evaluated = self._evaluated(states)
-        if self._before_ns is None:
-            evaluated[0] = False  # stands for nothing
-        cover = cover_ns(t_ns, longest_cover_ns(self._period_ns), self._before_ns)
-        cell = self._cells.find(t_ns, states["scene"], states["mode"])
-        every = Outputs(t_ns, cover, cell, _error(states))
-        grid, speed = _rows(every, evaluated), states["ref_speed"][evaluated]
-        speed = np.where(np.isfinite(speed), speed, 0.0)
+        outputs, grid, speed = self._epochs(states, self._evaluated(states), self._before_ns)
         self._cells.add_grid(grid.cell, grid.cover_ns, speed)
-        with_output = np.isfinite(every.error[:, 0]) & np.isfinite(every.error[:, 1])
-        self._cells.add_outputs("fusion", _rows(every, with_output), grid, speed)
+        self._cells.add_outputs("fusion", outputs, grid, speed)
         self._grid, self._speed = _after(self._grid, grid), np.concatenate((self._speed, speed))
         self._before_ns, self._rows = int(t_ns[-1]), self._rows + len(t_ns)
+
+    def _epochs(
+        self, states: Columns, evaluated: NDArray[np.bool_], before_ns: int | None
+    ) -> tuple[Outputs, Outputs, Floats]:
+        """Epochs with a state, evaluated epochs (G,) and the reference's speed at these (G,); before_ns: the epoch
+        before, None: the first row stands for nothing."""
+        t_ns = states["t_ns"]
+        if before_ns is None:
+            evaluated[0] = False
+        cover = cover_ns(t_ns, longest_cover_ns(self._period_ns), before_ns)
+        cell = self._cells.find(t_ns, states["scene"], states["mode"])
+        every = Outputs(t_ns, cover, cell, _error(states))
+        speed = states["ref_speed"][evaluated]
+        with_output = np.isfinite(every.error[:, 0]) & np.isfinite(every.error[:, 1])
+        return _rows(every, with_output), _rows(every, evaluated), np.where(np.isfinite(speed), speed, 0.0)
 
     def _evaluated(self, states: Columns) -> NDArray[np.bool_]:
         """Which epochs are scored; the others are counted by reason."""
@@ -108,12 +128,16 @@ class Scorer:
         evaluated: NDArray[np.bool_] = code == Excluded.EVALUATED
         for why in Excluded:
             self._excluded[why.name.lower()] += int((code == why).sum())
-        sigma = np.stack((states["ref_sigma_m"], states["ref_sigma_yaw"]), axis=-1)
-        position, yaw = well_known(sigma, self._limits, heading=np.isfinite(states["ref_yaw"]))
+        position, yaw = self._well_known(states)
         self._excluded["position_sigma"] += int((evaluated & ~position).sum())
         self._excluded["yaw_sigma"] += int((evaluated & position & ~yaw).sum())
         chosen: NDArray[np.bool_] = evaluated & position & yaw
         return chosen
+
+    def _well_known(self, states: Columns) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """At which epochs the reference is well below the limits, in position and in yaw."""
+        sigma = np.stack((states["ref_sigma_m"], states["ref_sigma_yaw"]), axis=-1)
+        return well_known(sigma, self._limits, heading=np.isfinite(states["ref_yaw"]))
 
     def _add_decisions(self, decisions: Columns) -> None:
         """Count what the filter decided, and line up the fixes: each once, whatever it decided, with a position."""
@@ -143,11 +167,12 @@ class Scorer:
             excluded={why: count for why, count in self._excluded.items() if count and why not in _UNCOUNTED},
             decisions=self._decision_counts(),
             hidden_length_s=None if planned is None or hide is None else hide["length_s"],
-            stretches=self._stretches.entries(planned or [], facts["start_ns"]),
+            stretches=self._stretches.entries(planned or [], facts["start_ns"], smoothed=facts.get("smoothed", False)),
             warnings=facts["warnings"],
             warning_counts=dict(Counter(entry["kind"] for entry in facts["warnings"])),
             left_out=facts["left_out"],
             health=facts["health"],
+            smoothed=facts.get("smoothed", False),
         )
 
     def _decision_counts(self) -> dict[str, dict[str, int]]:

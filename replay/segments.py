@@ -23,7 +23,7 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SEGMENT_NS = 60 * NS_PER_S
-METHODS = ("gnss", "egovm", "fusion")
+METHODS = ("gnss", "egovm", "fusion", "smoothed")
 THRESHOLDS = {"lon": (0.1, 0.2, 0.3), "lat": (0.1, 0.2, 0.3), "yaw": (0.1, 0.3, 0.6)}
 """m, m, deg."""
 AXES = tuple(THRESHOLDS)

@@ -19,7 +19,7 @@ from sensors.errors import EgolocError
 
 FILES = {
     *("config.toml", "manifest.json", "metrics.json", "states.parquet", "decisions.parquet"),
-    *("segments.parquet", "percentiles.parquet", "report.html"),
+    *("smoothed.parquet", "segments.parquet", "percentiles.parquet", "report.html"),
 }
 """What may stand in a run folder, besides recordings."""
 VERSIONED = ("egoloc", "numpy", "numba", "scipy", "pyarrow", "pymap3d", "pyproj", "mcap")

@@ -59,6 +59,8 @@ class Counts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     warnings: list[dict[str, str]]
     warning_counts: dict[str, int]
     left_out: list[dict[str, Any]]
+    smoothed: bool = False
+    """Whether the drive was smoothed as well; of several logs: any."""
     format: int = _FORMAT
     health: dict[str, int] = {}
     """Epochs by state of health (and "state/cause"), and restarts (``replay.health``)."""
@@ -142,6 +144,7 @@ def _merged_counts(parts: Mapping[str, Counts]) -> Counts:
         warning_counts=dict(sorted(warnings.items())),
         left_out=_left_out(parts),
         health=_added([counts.health for counts in every]),
+        smoothed=any(counts.smoothed for counts in every),
     )
 
 

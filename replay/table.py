@@ -26,7 +26,7 @@ MOST_STRETCHES = 40
 MOST_EXAMPLES = 3
 """Warnings of a kind that are printed of a campaign."""
 
-METHOD_NAMES = {"gnss": "GNSS-RTK", "egovm": "EgoVM", "fusion": "Fusion"}
+METHOD_NAMES = {"gnss": "GNSS-RTK", "egovm": "EgoVM", "fusion": "Fusion", "smoothed": "Smoothed"}
 
 EXCLUDED_TEXT = {
     "outside": "before or after the reference",
@@ -178,19 +178,29 @@ def percent(share: float | None, digits: int = 1) -> str:
 
 
 def _stretch_table(hidden: Metrics) -> Table:
-    """Every stretch without GNSS: when, and how far off at its end."""
+    """Every stretch without GNSS: when, how far off at its end and, of a smoothed drive, at worst before and after."""
     table = bare_table(2)
     named = any("log" in entry for entry in hidden["per_stretch"])  # a campaign's
     if named:
         table.add_column("\nlog", no_wrap=True)
     for header in ("hidden from\ns", "end error\nm", "sigma\nm", "error/\nsigma", "since GNSS\ns"):
         table.add_column(header, justify="right", no_wrap=True)
+    for header in ("largest\nm", "smoothed\nm", "error/\nsigma") if "smoothed" in hidden else ():
+        table.add_column(header, justify="right", no_wrap=True)
     for entry in hidden["per_stretch"]:
         error, sigma, since = entry["end_horizontal_m"], entry["end_sigma_m"], entry["since_gnss_s"]
         ratio = DASH if error is None else number(error / sigma, 2)
         cells = (f"{entry['start_s']:.1f}", number(error, 3), number(sigma, 3), ratio, number(since, 1))
-        table.add_row(*([entry["log"]] if named else []), *cells)
+        worst = _worst(entry) if "smoothed" in hidden else ()
+        table.add_row(*([entry["log"]] if named else []), *cells, *worst)
     return table
+
+
+def _worst(entry: Metrics) -> tuple[str, str, str]:
+    """The largest error of a stretch, that of the smoothed states, and the rms of their error over sigma."""
+    before, after = entry.get("within") or {}, entry.get("smoothed") or {}
+    worst, smoothed = (number(found.get("largest_horizontal_m"), 3) for found in (before, after))
+    return worst, smoothed, number(after.get("error_over_sigma_rms"), 2)
 
 
 def number(value: float | None, digits: int) -> str:
@@ -238,6 +248,13 @@ def _drift(hidden: Metrics) -> Iterator[str]:
             f"Horizontal error at the end of {hidden['stretches']} stretches of {hidden['length_s']:g} s: "
             f"median {end['p50']:.3f} m, 95 % {end['p95']:.3f} m, largest {end['max']:.3f} m; "
             f"error over sigma, rms {hidden['end_error_over_sigma_rms']:.2f}."
+        )
+    if hidden.get("smoothed", {}).get("error_over_sigma_rms") is not None:
+        before, after = hidden["largest_horizontal_m"], hidden["smoothed"]["largest_horizontal_m"]
+        yield (
+            f"Largest horizontal error within them: median {before['p50']:.3f} m, largest {before['max']:.3f} m; "
+            f"smoothed: median {after['p50']:.3f} m, largest {after['max']:.3f} m, error over sigma, rms "
+            f"{hidden['smoothed']['error_over_sigma_rms']:.2f}."
         )
     if hidden["without_end"]:
         yield f"{hidden['without_end']} stretches have no fixed fix or no state at their end."

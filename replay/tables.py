@@ -1,4 +1,4 @@
-"""states.parquet and decisions.parquet, written as their rows come and read back piece by piece.
+"""states.parquet, decisions.parquet and smoothed.parquet, written as their rows come and read back piece by piece.
 
 Row groups hold ROWS rows whatever the batches: the bytes depend on the rows alone. Columns that are codes in memory are
 dictionary strings there. `log` is the same in all rows, so that the tables of many logs are one dataset.
@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +21,8 @@ from replay.run_files import CODES, TEXTS, read_groups
 from replay.scoring import DECISIONS, STATES
 from replay.store import Keep
 from sensors.clock import NS_PER_S
+from sensors.datasets.run_trajectory import RUN_KEY
+from sensors.geodesy import MapFrame
 
 if TYPE_CHECKING:
     import pyarrow
@@ -29,15 +32,17 @@ Texts = Mapping[str, Sequence[str]]
 
 ROWS = 32_768
 """Of a row group: 55 minutes of states."""
+SMOOTHED = "smoothed.parquet"
 NAMES = {name: tuple(member.name.lower() for member in codes) for name, codes in CODES.items()}
 OPTIONS = {"compression": "lz4", "write_statistics": False, "write_page_checksum": True}
 
 
 class Tables:
-    """Both tables in a run folder, as far as they are kept. To be used as a context."""
+    """The tables in a run folder, as far as they are kept. To be used as a context."""
 
     def __init__(self, folder: Path, log: str, keep: Keep) -> None:
-        self._keep = keep
+        self._folder, self._log, self._keep = folder, log, keep
+        self._smoothed: Table | None = None
         self._states, self._decisions = (Table(folder / f"{name}.parquet", log) for name in ("states", "decisions"))
 
     @property
@@ -54,11 +59,19 @@ class Tables:
             decisions = no_rows() | {name: decisions[name][:0] for name in TEXTS}
         self._decisions.add(_chosen(decisions, kept_decisions(decisions["accepted"], self._keep)), texts)
 
+    def add_smoothed(self, states: Columns, batch: Batch, frame: MapFrame | None) -> None:
+        """Write the rows that are kept of smoothed states. batch: the drive's last; frame: of their coordinates."""
+        if self._smoothed is None:
+            said = {} if frame is None else {RUN_KEY: msgspec.json.encode({"map_frame": frame})}
+            self._smoothed = Table(self._folder / SMOOTHED, self._log, said)
+        texts = {"scene": batch.scenes, "mode": batch.modes}
+        self._smoothed.add(_chosen(states, kept_states(states["t_ns"], self._keep)), texts)
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, _: BaseException | None, __: TracebackType | None) -> None:
-        for table in (self._states, self._decisions):
+        for table in filter(None, (self._states, self._decisions, self._smoothed)):
             if kind is None:
                 table.close()
             else:
@@ -84,8 +97,9 @@ def kept_decisions(accepted: NDArray[np.bool_], keep: Keep) -> NDArray[np.bool_]
 class Table:
     """One Parquet file that grows by row groups."""
 
-    def __init__(self, path: Path, log: str) -> None:
-        self._path, self._log = path, log
+    def __init__(self, path: Path, log: str, said: Mapping[bytes, bytes] | None = None) -> None:
+        """said: of the whole, for the file's metadata."""
+        self._path, self._log, self._said = path, log, said
         self._writer: Any = None
         self._waiting: list[Columns] = []
         self._rows = 0
@@ -125,7 +139,7 @@ class Table:
         for name in self._codes:  # only texts that have occurred: what is still to come must not show
             self._codes[name] = max(self._codes[name], int(columns[name].max(initial=0)))
         seen = {name: self._texts[name][: code + 1] for name, code in self._codes.items()}
-        table = _arrow_table(columns, seen, self._log)
+        table = _arrow_table(columns, seen, self._log).replace_schema_metadata(self._said)
         if self._writer is None:
             coded = [field.name for field in table.schema if str(field.type).startswith("dictionary")]
             self._writer = pq.ParquetWriter(self._path, table.schema, use_dictionary=coded, **OPTIONS)
@@ -147,6 +161,14 @@ def stored_batches(folder: Path) -> Iterator[Batch]:
             tuple(texts["scene"]),
             tuple(texts["mode"]),
         )
+
+
+def stored_smoothed(folder: Path) -> Iterator[Columns]:
+    """The rows of the smoothed states again, with the columns that scoring reads, by row groups."""
+    texts: dict[str, list[str]] = {name: [""] for name in TEXTS}
+    rows = _Reader(folder / SMOOTHED, STATES, texts)
+    while rows.rows is not None:
+        yield rows.take()
 
 
 class _Reader:

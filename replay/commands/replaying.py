@@ -42,7 +42,7 @@ class Replay:
     ] = None
     """Largest lon, lat, yaw error: paper 0.6 m, 0.3 m, 1 deg; highway 1.4, 0.57, 1.5; local-street 0.29, 0.29, 0.5."""
     reference: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: the log's)")] = None
-    """A trajectory to score against: TUM, CSV with named columns, or Applanix."""
+    """A trajectory to score against: TUM, CSV with named columns, Applanix, or smoothed.parquet of a run."""
     hide_gnss: Annotated[
         str | None, tyro.conf.arg(metavar="EVERY:LENGTH", help_behavior_hint="(default: hide nothing)")
     ] = None
@@ -54,6 +54,8 @@ class Replay:
     inject: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
     """Make sensors fail, as in gnss-jump:severe@60+20: NAME[:mild|medium|severe][@BEGIN[+LENGTH]] in s since the first
     IMU sample; several with commas or --inject again. Names: docs/faults.md, or any other word."""
+    smooth: bool = False
+    """Smooth each drive as well, backwards from its end: a row more, and smoothed.parquet, which --reference reads."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
     """Logs replayed at a time, each in a process of its own."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")] = None
@@ -105,6 +107,8 @@ class Replay:
             config = msgspec.structs.replace(config, fusion=fusion)
         if self.hide_gnss is not None:
             config = msgspec.structs.replace(config, hide_gnss=parse_hide_gnss(self.hide_gnss))
+        if self.smooth:
+            config = msgspec.structs.replace(config, smooth=True)
         if self.reference is not None and config.hide_gnss is not None:
             raise EgolocError("--hide-gnss scores against the hidden fixes: leave out --reference")
         return with_faults(config, self.inject or config.inject)

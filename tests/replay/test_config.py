@@ -51,7 +51,8 @@ def test_any_text_survives(topics: dict[str, str]) -> None:
         ("[fusion.gnss]\ninflaton = 3", r'fusion\.gnss: unknown key "inflaton"; did you mean "inflation"\?'),
         (
             "colour = 1",
-            'unknown key "colour"; expected topics, vehicle, map_frame, fusion, limits, hide_gnss, inject, seed',
+            'unknown key "colour"; expected topics, vehicle, map_frame, fusion, limits, hide_gnss, smooth, inject, '
+            "seed",
         ),
         ("[vehicle.imu]\nnoise = 1", r'vehicle\.imu: unknown key "noise"; expected name, samples'),
         ('[fusion.gnss]\nuse = "yes"', r"fusion\.gnss\.use: expected `bool`, got `str`"),

@@ -91,6 +91,19 @@ def test_what_is_drawn_is_what_the_tables_say(make_run: MakeRun) -> None:
     assert np.allclose(variances, (3 * table["sigma_lat"].to_numpy()) ** 2)
 
 
+def test_a_smoothed_run_has_a_track_and_errors_more(make_run: MakeRun) -> None:
+    run = make_run()
+    plain = entities(write_recording(run))
+    table = pq.read_table(run / "states.parquet")
+    pq.write_table(table.slice(100), run / "smoothed.parquet")
+    rrd = write_recording(run)
+    errors = {f"/run/error/{axis}/smoothed" for axis in ("lon", "lat", "yaw")}
+    assert entities(rrd) - plain == errors | {"/run/far/track/smoothed", "/run/near/track/smoothed"}
+    drawn = column(rrd, "/run/error/lat/smoothed", "Scalars:scalars")
+    error, shown = table["err_lat"].to_numpy()[100:], np.array(drawn, np.float64)
+    assert np.allclose(shown[np.isfinite(shown)], error[np.isfinite(error)], rtol=1e-12)
+
+
 def test_the_map_is_centred_before_it_loses_precision(make_run: MakeRun) -> None:
     run = make_run(duration_s=15.0)
     table = pq.read_table(run / "states.parquet")
