@@ -13,6 +13,7 @@ from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import Bench, View
+from replay.commands.noise import Allan
 from replay.commands.replaying import Replay
 from sensors.errors import EgolocError
 
@@ -25,6 +26,7 @@ COMMANDS = {
     "score": Score,
     "compare": Compare,
     "view": View,
+    "allan": Allan,
     "bench": Bench,
 }
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."

@@ -23,6 +23,8 @@ LEAST_CLUSTERS = 5
 """The longest averaging time that is looked at fits into the record so often."""
 FLICKER = 0.6642824703
 """Deviation of flicker noise over its coefficient: sqrt(2 ln 2 / pi) (IEEE Std 952, C.1.2.3)."""
+DRIFT_SPAN_S = 600.0
+"""In a shorter record a drift is not told from settling, wind and people: only noise is looked for, s."""
 SHORTEST_DRIFT_S = 3.0
 """A drift faster than this is not told from vibration, s."""
 PER_DECADE = 48
@@ -119,7 +121,7 @@ def pooled(curve: AllanCurve) -> AllanCurve:
 
 
 def noise_of(curve: AllanCurve, axis: int = 0) -> SensorNoise:
-    """The noise that explains one axis of a curve."""
+    """The noise that explains one axis of a curve; a record below DRIFT_SPAN_S is explained without a drift."""
     variance, freedom = curve.variance[:, axis], (curve.clusters - 1.0) / SHARED
     if not (variance > 0).all():
         raise EgolocError("Allan deviation: expected noise, got samples that do not change")
@@ -130,7 +132,8 @@ def noise_of(curve: AllanCurve, axis: int = 0) -> SensorNoise:
     likely = np.flatnonzero(misfit <= misfit.min() + 1.0)
     lowest = int(np.argmin(variance))
     deviation = np.sqrt(variance[lowest])
-    shows = best.drift_rate > 2.0 * best.drift_rate_error and best.misfit < _fit_white(curve, axis) - 4.0
+    long_enough = curve.span_s >= DRIFT_SPAN_S
+    shows = long_enough and best.drift_rate > 2.0 * best.drift_rate_error and best.misfit < _fit_white(curve, axis) - 4.0
     ends = np.isinf(times[likely[-1]]) or not shows
     return SensorNoise(
         random_walk=best.random_walk,
@@ -162,18 +165,21 @@ class _Fit:
 
 
 def _times(curve: AllanCurve) -> Floats:
-    """Time constants to try, s: the last is a drift that never turns back."""
+    """Time constants to try, s: the last is a drift that never turns back; 0: no drift at all."""
     low, high = max(8.0 * curve.tau[0], SHORTEST_DRIFT_S), 2.0 * curve.span_s
-    if high <= low:
-        return np.array([np.inf])
+    if curve.span_s < DRIFT_SPAN_S:
+        return np.zeros(1)
     count = int(np.ceil(PER_DECADE * np.log10(high / low))) + 1
     return np.append(np.geomspace(low, high, count), np.inf)
 
 
 def _columns(tau: Floats, time_s: float) -> Floats:
     """(K, 3) Allan variance of quantization, white noise and a drift of unit rate (IEEE Std 952, C.1.2)."""
+    noise = np.stack((3.0 / tau**2, 1.0 / tau), axis=-1)
+    if not time_s:
+        return np.column_stack((noise, np.zeros_like(tau)))
     drift = tau / 3.0 if np.isinf(time_s) else time_s / 2.0 * gauss_markov_variance(tau, time_s)
-    return np.stack((3.0 / tau**2, 1.0 / tau, drift), axis=-1)
+    return np.column_stack((noise, drift))
 
 
 def _fit(tau: Floats, variance: Floats, freedom: Floats, time_s: float) -> _Fit:
@@ -203,7 +209,7 @@ def _errors(tau: Floats, time_s: float, squares: Floats, share: Floats) -> Float
 def _fit_white(curve: AllanCurve, axis: int) -> float:
     """Misfit without any drift."""
     variance, freedom = curve.variance[:, axis], (curve.clusters - 1.0) / SHARED
-    _, model = _solve(_columns(curve.tau, np.inf)[:, :2], variance, freedom)
+    _, model = _solve(_columns(curve.tau, 0.0), variance, freedom)
     return _deviance(variance, model, freedom)
 
 
@@ -213,6 +219,7 @@ def _solve(columns: Floats, variance: Floats, freedom: Floats) -> tuple[Floats, 
     for _ in range(ROUNDS):
         share = np.sqrt(freedom / 2.0) / model
         size = np.linalg.norm(columns * share[:, None], axis=0)
+        size[size == 0.0] = 1.0
         scaled, _ = nnls(columns * share[:, None] / size, variance * share)
         squares = scaled / size
         model = np.maximum(columns @ squares, 1e-3 * variance)
