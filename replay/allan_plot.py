@@ -36,7 +36,13 @@ def _panel(axes: Any, analysis: Analysis, sensor: str) -> None:
     for column, axis in enumerate(AXES[:3]):
         deviation = scale * np.sqrt(curve.variance[:, column])
         axes.errorbar(
-            curve.tau, deviation, deviation * np.minimum(curve.error, 0.9), color=COLOURS[axis], lw=1, capsize=2, label=axis
+            curve.tau,
+            deviation,
+            deviation * np.minimum(curve.error, 0.9),
+            color=COLOURS[axis],
+            lw=1,
+            capsize=2,
+            label=axis,
         )
     every, tau = noise["all"], np.geomspace(curve.tau[0], curve.tau[-1], 200)
     for label, variance, style in parts_of(every, tau):

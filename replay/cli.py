@@ -13,7 +13,7 @@ from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import Bench, View
-from replay.commands.noise import Allan
+from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
 from sensors.errors import EgolocError
 
@@ -27,6 +27,7 @@ COMMANDS = {
     "compare": Compare,
     "view": View,
     "allan": Allan,
+    "noise": Noise,
     "bench": Bench,
 }
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."

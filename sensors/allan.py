@@ -133,7 +133,9 @@ def noise_of(curve: AllanCurve, axis: int = 0) -> SensorNoise:
     lowest = int(np.argmin(variance))
     deviation = np.sqrt(variance[lowest])
     long_enough = curve.span_s >= DRIFT_SPAN_S
-    shows = long_enough and best.drift_rate > 2.0 * best.drift_rate_error and best.misfit < _fit_white(curve, axis) - 4.0
+    shows = (
+        long_enough and best.drift_rate > 2.0 * best.drift_rate_error and best.misfit < _fit_white(curve, axis) - 4.0
+    )
     ends = np.isinf(times[likely[-1]]) or not shows
     return SensorNoise(
         random_walk=best.random_walk,

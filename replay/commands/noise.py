@@ -1,4 +1,4 @@
-"""egoloc allan: how noisy an IMU is."""
+"""egoloc allan and noise: how noisy an IMU is, and how noisy GNSS and pose fixes are."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,3 +64,37 @@ class Allan:
             print_json(analysis.facts)
         else:
             print_analysis(analysis, self.out)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of GNSS and pose fixes: how long their errors last, and how much larger or smaller they are than stated.
+
+    First what the run's innovations say; then its log is filtered again and again, to find the noise under which they are
+    most likely, with 95 % intervals. Prints the lines to paste into a config.
+    """
+
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder of one log, with all decisions."""
+    log: Annotated[
+        str | None, tyro.conf.arg(metavar="LOG", help_behavior_hint="(default: the one that the run was made of)")
+    ] = None
+    """Its log, where that has moved."""
+    duration_s: Annotated[float, tyro.conf.arg(metavar="S")] = 1800.0
+    """Filter so much of the log, from its start, s."""
+    json: bool = False
+    """Print JSON instead of the tables."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Judge, search, print."""
+        from replay.commands.looking import check_no_campaign
+        from replay.noise import facts, noise_of_run
+        from replay.noise_table import print_noise
+
+        check_no_campaign(self.folder)
+        with stage(f"noise of {self.folder}") as tell:
+            found = noise_of_run(self.folder, self.log, self.duration_s, tell)
+        if self.json:
+            print_json(facts(found))
+        else:
+            print_noise(found)
