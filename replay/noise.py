@@ -1,4 +1,4 @@
-"""`egoloc noise`: how noisy a run's GNSS and pose fixes are, from what became of them and from filtering its log again."""
+"""`egoloc noise`: how noisy a run's GNSS and pose fixes are, from its decisions and from filtering its log again."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -95,7 +95,8 @@ def beginning(source: LogSource, config: RunConfig, duration_s: float) -> Log:
     if end_ns is not None:
         records = {name: getattr(whole, name) for name in SENSORS}
         cut = {name: r and r[: int(np.searchsorted(r.t_ns, end_ns))] for name, r in records.items()}
-        whole = replace(whole, **{name: record or None for name, record in cut.items()})
+        held: dict[str, Any] = {name: record or None for name, record in cut.items()}
+        whole = replace(whole, **held)
     return replace(whole, vehicle=config.vehicle or whole.vehicle, map_frame=config.map_frame or whole.map_frame)
 
 

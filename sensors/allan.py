@@ -55,13 +55,13 @@ class AllanCurve:
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """What explains an Allan curve, in the sensor's unit u (rad/s, m/s^2), each with one standard deviation in `*_error`.
+    """What explains an Allan curve, in the sensor's unit u (rad/s, m/s^2); `*_error`: one standard deviation.
 
     random_walk: of the integral, u sqrt(s); drift_rate: driving noise of the drift, u/sqrt(s), the coefficient of rate
-    random walk on times far below its time constant; drift_sigma u and drift_time_s: the Gauss-Markov process, inf where
-    the record is too short to show that the drift ever turns back; quantization: u s. A drift_rate of 0: none shows.
-    instability: least deviation over 0.664, u, at instability_tau_s; where the curve still falls at its end that is only
-    an upper bound (instability_reached is False).
+    random walk on times far below its time constant; drift_sigma u and drift_time_s: the Gauss-Markov process, inf
+    where the record is too short to show that the drift ever turns back; quantization: u s. A drift_rate of 0: none
+    shows. instability: least deviation over 0.664, u, at instability_tau_s; where the curve still falls at its end that
+    is only an upper bound (instability_reached is False).
     """
 
     random_walk: float
@@ -90,7 +90,7 @@ def allan_curve(signal: Floats, interval_s: float) -> AllanCurve:
     angle = np.zeros((count + 1, signal.shape[1]))
     np.cumsum(signal - signal.mean(axis=0), axis=0, out=angle[1:])
     variance = np.array([overlapping_variance(angle, int(m)) for m in factors])
-    return AllanCurve(factors * interval_s, variance, count / factors, count * interval_s)
+    return AllanCurve(interval_s * factors.astype(np.float64), variance, count / factors, count * interval_s)
 
 
 def overlapping_variance(angle: Floats, factor: int) -> Floats:
@@ -185,7 +185,7 @@ def _columns(tau: Floats, time_s: float) -> Floats:
 
 
 def _fit(tau: Floats, variance: Floats, freedom: Floats, time_s: float) -> _Fit:
-    """Squares of the coefficients, none below zero: a measured variance is the model's times chi-square over freedom."""
+    """Squares of the coefficients, none below zero; a measured variance is the model's times chi-square / freedom."""
     columns = _columns(tau, time_s)
     squares, model = _solve(columns, variance, freedom)
     errors = _errors(tau, time_s, squares, np.sqrt(freedom / 2.0) / model)

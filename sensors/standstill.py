@@ -1,8 +1,8 @@
 """Where an IMU rests: the longest stretch of even samples in which nothing moves.
 
 Seconds are judged one by one, as the filter's zero-velocity update does: by the spread of the specific force's norm and
-of the yaw rate (an idling engine shakes the other two), against fixed limits and against the quietest ten seconds of the
-log; a steady turn by its mean rate; and by GNSS or wheel speeds, where the log has them.
+of the yaw rate (an idling engine shakes the other two), against fixed limits and against the quietest ten seconds of
+the log; a steady turn by its mean rate; and by GNSS or wheel speeds, where the log has them.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""`egoloc bench consistency`: whether the filter knows how wrong it is, over many seeded drives, and a day without harm.
+"""`egoloc bench consistency`: whether the filter knows how wrong it is, over many seeded drives and a long one.
 
 NEES (Bar-Shalom 2001, sec. 5.4) of each block of the error state by the whole covariance, once a second. `per_dof`:
-mean over drives and epochs, 1 for a filter that is right about itself, more where it is overconfident. `inside`: part of
-the epochs whose mean over the drives lies in the two-sided 95 % interval, which only white errors that the filter is
+mean over drives and epochs, 1 for a filter that is right about itself, more where it is overconfident. `inside`: part
+of the epochs whose mean over the drives lies in the two-sided 95 % interval, which only white errors that the filter is
 told of can reach. `single`: part of all single values that lie in theirs.
 """
 

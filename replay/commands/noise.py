@@ -15,8 +15,8 @@ ALLAN_OUT = Path("runs/allan")
 class Allan:
     """Noise figures of an IMU, by overlapping Allan deviation over the longest stretch of a log at rest.
 
-    Prints angle and velocity random walk, bias instability and drift of each axis, and the vehicle table to paste into a
-    config. Hours at rest, engine off, are what it takes for the drifts; a minute shows the random walks.
+    Prints angle and velocity random walk, bias instability and drift of each axis, and the vehicle table to paste into
+    a config. Hours at rest, engine off, are what it takes for the drifts; a minute shows the random walks.
     """
 
     log: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LOG")]
@@ -70,8 +70,8 @@ class Allan:
 class Noise:
     """Noise of GNSS and pose fixes: how long their errors last, and how much larger or smaller they are than stated.
 
-    First what the run's innovations say; then its log is filtered again and again, to find the noise under which they are
-    most likely, with 95 % intervals. Prints the lines to paste into a config.
+    First what the run's innovations say; then its log is filtered again and again, to find the noise under which they
+    are most likely, with 95 % intervals. Prints the lines to paste into a config.
     """
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]

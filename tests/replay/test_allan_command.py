@@ -40,7 +40,7 @@ def resting(hours: float, preset: PresetName = "tactical", hz: float = 20.0, see
 
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_a_preset_comes_back_from_six_hours_at_rest(preset: PresetName) -> None:
-    """White noise within 2 %; of the drift the driving noise sigma sqrt(2 / T), which is all that the filter uses of it,
+    """White noise within 2 %; of the drift the driving noise sigma sqrt(2 / T), which is all that the filter uses,
     within three of its errors, which are below 10 %."""
     given = PRESETS[preset].spec
     analysis = analyse(ScenarioSource(resting(6.0, preset)), RunConfig())
@@ -60,7 +60,7 @@ def test_a_preset_comes_back_from_six_hours_at_rest(preset: PresetName) -> None:
 
 @pytest.mark.slow
 def test_three_days_at_rest_show_time_constants() -> None:
-    """A drift's sigma and time constant by themselves take many time constants: within 10 and 25 % after 260 of them."""
+    """A drift's sigma and time constant by themselves take long: within 10 and 25 % after 260 time constants."""
     analysis = analyse(ScenarioSource(resting(72.0, hz=10.0)), RunConfig())
     given = PRESETS["tactical"].spec
     for sensor, field in zip(("gyro", "accel"), FOUND[2:], strict=True):
