@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
@@ -32,6 +33,7 @@ from fusion.state import (
     VELOCITY,
 )
 from replay.bench.measure import conditions, row
+from replay.table import bare_table
 from sensors.clock import NS_PER_S
 from sensors.geodesy import enu_from_llh
 from sensors.simulate.drive import Drive, DriveConfig, simulate_drive, simulate_pieces
@@ -211,6 +213,27 @@ def inside(scores: Floats, dof: int) -> float:
 
 def _chi_square(probability: float, dof: Any) -> Any:
     return 2.0 * gammaincinv(np.asarray(dof) / 2.0, probability)
+
+
+def table(result: Mapping[str, Any]) -> Table:
+    """One line for each block: NEES over degrees of freedom with its least and largest drive, then the shares."""
+    shown = bare_table(2)
+    for header in ("drives: block", "NEES/dof", "least", "largest", "inside %", "single %"):
+        shown.add_column(header, justify="left" if header.startswith("drives") else "right", no_wrap=True)
+    by_name: dict[str, dict[str, Any]] = {}
+    for each in result["rows"]:
+        by_name.setdefault(each["name"], {})[each["metric"]] = each
+    for name, found in by_name.items():
+        if "per_dof" in found:
+            mean = found["per_dof"]
+            shares = (f"{100 * found[metric]['median']:.1f}" for metric in ("inside", "single"))
+            shown.add_row(name, *(f"{mean[key]:.2f}" for key in ("median", "min", "max")), *shares)
+        else:
+            for metric, each in found.items():
+                shown.add_row(
+                    f"{name}: P, {metric}", f"{each['median']:.2g}", f"{each['min']:.2g}", f"{each['max']:.2g}"
+                )
+    return shown
 
 
 def health_over(hours: float, config: FusionConfig, tell: Watch) -> tuple[list[float], list[float]]:

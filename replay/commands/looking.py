@@ -1,9 +1,10 @@
 """egoloc view and bench."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -49,14 +50,20 @@ class View:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure speed side by side with other libraries, in one run on one core."""
+    """Measure speed side by side with other libraries, or whether the filter's sigmas are honest, on one core."""
 
-    name: tyro.conf.Positional[Literal["filter", "replay", "mcap"]]
-    """filter: IMU steps/s of the filter; replay: an hour of log to metrics.json; mcap: IMU messages/s read."""
+    name: tyro.conf.Positional[Literal["filter", "replay", "mcap", "consistency"]]
+    """filter: IMU steps/s; replay: an hour of log to metrics.json; mcap: messages/s read; consistency: NEES of drives."""
     repeats: int = 5
     """Timed calls of each row, after one that warms up; the median counts."""
     hours: tuple[float, ...] = (1.0,)
     """Lengths of the log, h (replay only): figures of each and how the time grows."""
+    seeds: int = 200
+    """Simulated drives of each case (consistency only)."""
+    config: Annotated[
+        Path | None, tyro.conf.arg(metavar="FILE.toml", help_behavior_hint="(default: the default configuration)")
+    ] = None
+    """How drives whose errors last are filtered (consistency only)."""
     json: bool = False
     """Print JSON."""
 
@@ -64,15 +71,26 @@ class Bench:
         """Run one benchmark."""
         from replay.bench.measure import one_core
 
-        options = {"hours": self.hours} if self.name == "replay" else {}
-        with stage(f"benchmark {self.name}"), one_core():
-            result = import_module(f"replay.bench.{self.name}").run(repeats=self.repeats, **options)
+        bench = import_module(f"replay.bench.{self.name}")
+        with stage(f"benchmark {self.name}") as tell, one_core():
+            result = bench.run(**self._options(tell))
         if self.json:
             print_json(result)
             return
         from replay.table import bench_table, output_console
 
-        output_console().print(bench_table(result))
+        output_console().print(bench.table(result) if self.name == "consistency" else bench_table(result))
+
+    def _options(self, tell: Callable[[str], None]) -> dict[str, Any]:
+        """What the benchmark is told."""
+        if self.name != "consistency":
+            return {"repeats": self.repeats} | ({"hours": self.hours} if self.name == "replay" else {})
+        from replay.config import load_config
+
+        if self.seeds < 1:
+            raise EgolocError(f"--seeds: expected 1 or more, got {self.seeds}")
+        config = None if self.config is None else load_config(self.config).fusion
+        return {"seeds": self.seeds, "config": config, "watch": tell}
 
 
 def check_no_campaign(folder: Path) -> None:
