@@ -133,7 +133,7 @@ def estimate(log: Log, config: FusionConfig | None = None, tell: Callable[[str],
     found = {s.name: _found(s, x[i], spread[i]) for i, s in enumerate(sought)}
     after = run(kept, search.config(x))
     best = with_values(given, {name: each.value for name, each in found.items()})
-    gain = likelihood - search.likelihood(_white(search.open))
+    gain = likelihood - search.likelihood(_white(search.config(x)))
     return NoiseEstimate(found, best, gain, consistency(first.decisions), consistency(after.decisions), search.runs)
 
 

@@ -102,7 +102,13 @@ def autocovariance(t_ns: NDArray[np.int64], scores: Floats, step_ns: float) -> t
 
 
 def _exponential(correlation: Floats, pairs: Floats) -> tuple[float, float | None]:
-    """Share and time (in steps) of share * exp(-lag / time) through correlations at lags 1, 2, ..; (0, None): white."""
+    """Share and time (in steps) of share * exp(-lag / time) through correlations at lags 1, 2, ..; (0, None): white.
+
+    Up to where they fall below a fifth of the first: what follows is the estimate's own noise, which lasts as well.
+    """
+    below = correlation < 0.2 * correlation[0]
+    ends = max(int(np.argmax(below)) if below.any() else len(correlation), 5)
+    correlation, pairs = correlation[:ends], pairs[:ends]
     lag = np.arange(1, len(correlation) + 1)
     best, found = float((pairs * correlation**2).sum()), (0.0, None)
     white = best

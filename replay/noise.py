@@ -11,9 +11,9 @@ from fusion.adaptive import NoiseEstimate, estimate
 from fusion.innovations import AxisInnovations, consistency
 from fusion.result import Decisions, Reason, Sensor
 from replay.config import RunConfig, load_config
-from replay.run_files import EXPECTED, read_json, read_table
+from replay.run_files import EXPECTED, checked, read_json, read_table
 from replay.sources import LogSource, McapSource, parse
-from replay.store import file_hash
+from replay.store import Keep, file_hash
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.pieces import SENSORS, join
@@ -46,10 +46,13 @@ def noise_of_run(folder: Path, log: str | None, duration_s: float, tell: Callabl
         raise EgolocError(f"{folder}: {EXPECTED}")
     if not duration_s > 0:
         raise EgolocError(f"--duration-s: expected more than 0, got {duration_s:g}")
+    manifest = folder / "manifest.json"
+    if checked(read_json(manifest).get("keep", {}), Keep, manifest).decisions != "all":
+        raise EgolocError(f"{folder}: expected a run with all decisions, got one made with --decisions: replay the log")
     innovations = consistency(read_decisions(folder / "decisions.parquet"))
     config = load_config(folder / "config.toml")
     try:
-        source = parse(log)[0] if log is not None else _source_of(folder)
+        source = _source_of(folder) if log is None else parse(log)[0]
     except MissingLogError as error:
         return RunNoise(folder, innovations, None, str(error))
     tell("reading the log")

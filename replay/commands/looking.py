@@ -53,7 +53,7 @@ class Bench:
     """Measure speed side by side with other libraries, or whether the filter's sigmas are honest, on one core."""
 
     name: tyro.conf.Positional[Literal["filter", "replay", "mcap", "consistency"]]
-    """filter: IMU steps/s; replay: an hour of log to metrics.json; mcap: messages/s read; consistency: NEES of drives."""
+    """filter: IMU steps/s; replay: an hour of log to metrics.json; mcap: messages/s; consistency: NEES of drives."""
     repeats: int = 5
     """Timed calls of each row, after one that warms up; the median counts."""
     hours: tuple[float, ...] = (1.0,)
