@@ -146,11 +146,12 @@ def facts(noise: RunNoise) -> dict[str, Any]:
 
 
 def config_lines(found: NoiseEstimate) -> str:
-    """The lines to paste into a config: what the drive does not tell is left out."""
+    """The lines to paste into a config: what the drive does not tell is left out, and share and time go together."""
     sections: dict[str, list[str]] = {}
+    silent = {name.partition(".")[0] for name, each in found.found.items() if not (each.observed or each.at_bound)}
     for name, each in found.found.items():
         section, field = name.split(".")
-        if each.observed or each.at_bound:
+        if section not in silent or (each.observed and not field.startswith("lasting")):
             sections.setdefault(section, []).append(f"{field} = {float(f'{each.value:.3g}')!r}")
     return "\n\n".join("\n".join((f"[fusion.{section}]", *lines)) for section, lines in sections.items())
 

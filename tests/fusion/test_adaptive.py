@@ -61,20 +61,19 @@ def test_what_lasts_10_s_and_100_m_is_found() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 5, 7])
-def test_what_lasts_30_s_and_300_m_is_found(seed: int) -> None:
-    """Twenty such times and lengths: rougher, and the intervals know it."""
-    found = estimate(lasting(seed, 600.0, 0.7, 30.0, 0.7, 300.0)).found
-    truth = TRUTH | {
-        "gnss.lasting_share": 0.7,
-        "gnss.lasting_s": 30.0,
-        "pose.lasting_share": 0.7,
-        "pose.lasting_m": 300.0,
-    }
+def test_what_lasts_30_s_and_300_m_is_found_in_eight_drives() -> None:
+    """Ten minutes hold twenty such times and lengths: rough figures, and intervals that know it. Prints the ranges."""
+    lasts = {"gnss.lasting_share": 0.7, "gnss.lasting_s": 30.0, "pose.lasting_share": 0.7, "pose.lasting_m": 300.0}
+    truth = TRUTH | lasts
+    drives = [estimate(lasting(seed, 600.0, 0.7, 30.0, 0.7, 300.0)).found for seed in range(1, 9)]
+    hits = 0
     for name, value in truth.items():
-        each = found[name]
-        assert abs(np.log(each.value / value)) < 1.5 * np.log(each.high / each.low) / 2.0, name
-        assert each.high / each.low < 15.0, name
+        found = [drive[name] for drive in drives]
+        hits += sum(each.low <= value <= each.high for each in found)
+        print(f"{name}: {min(f.value for f in found):.3g} to {max(f.value for f in found):.3g}, truth {value:g}")
+        assert np.exp(np.mean([np.log(f.value / value) for f in found])) == pytest.approx(1.0, abs=0.4), name
+    print(f"{hits} of {len(drives) * len(truth)} inside their 95 % intervals")
+    assert hits >= 0.85 * len(drives) * len(truth)
 
 
 @pytest.mark.slow
