@@ -132,7 +132,7 @@ def estimate(log: Log, config: FusionConfig | None = None, tell: Callable[[str],
     spread = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
     found = {s.name: _found(s, x[i], spread[i]) for i, s in enumerate(sought)}
     after = run(kept, search.config(x))
-    best = with_values(given, {name: each.value for name, each in found.items()})
+    best = with_values(given, split_of({name: each.value for name, each in found.items()}))
     gain = likelihood - search.likelihood(_white(search.config(x)))
     return NoiseEstimate(found, best, gain, consistency(first.decisions), consistency(after.decisions), search.runs)
 
@@ -144,6 +144,13 @@ def with_values(config: FusionConfig, values: Mapping[str, float | bool]) -> Fus
         part = msgspec.structs.replace(getattr(config, section), **{field: value})
         config = msgspec.structs.replace(config, **{section: part})
     return config
+
+
+def split_of(values: Mapping[str, float]) -> dict[str, float]:
+    """The values with what is white beside what lasts: here they share the variance, so that its size has one name."""
+    shares = {name: value for name, value in values.items() if name.endswith(".lasting_share")}
+    white = {f"{name.partition('.')[0]}.white_share": 1.0 - value for name, value in shares.items()}
+    return {**values, **white}
 
 
 def open_to_all(config: FusionConfig) -> FusionConfig:
@@ -192,7 +199,7 @@ def _sought(decisions: Decisions) -> tuple[Sought, ...]:
 def _white(config: FusionConfig) -> FusionConfig:
     """All noise white and as large as stated."""
     ones = dict.fromkeys(("gnss.inflation", "gnss.velocity_inflation", "pose.inflation"), 1.0)
-    return with_values(config, ones | {"gnss.lasting_share": 0.0, "pose.lasting_share": 0.0})
+    return with_values(config, ones | split_of({"gnss.lasting_share": 0.0, "pose.lasting_share": 0.0}))
 
 
 def _found(sought: Sought, x: float, spread: float) -> Found:
@@ -220,7 +227,7 @@ class _Search:
 
     def config(self, x: Floats) -> FusionConfig:
         """The configuration at x."""
-        return with_values(self.open, {s.name: s.outward(x[i]) for i, s in enumerate(self._sought)})
+        return with_values(self.open, split_of({s.name: s.outward(x[i]) for i, s in enumerate(self._sought)}))
 
     def likelihood(self, config: FusionConfig) -> float:
         """Logarithm, but for a constant."""

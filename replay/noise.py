@@ -152,7 +152,10 @@ def config_lines(found: NoiseEstimate) -> str:
     for name, each in found.found.items():
         section, field = name.split(".")
         if section not in silent or (each.observed and not field.startswith("lasting")):
-            sections.setdefault(section, []).append(f"{field} = {float(f'{each.value:.3g}')!r}")
+            lines = sections.setdefault(section, [])
+            lines.append(f"{field} = {float(f'{each.value:.3g}')!r}")
+            if field == "lasting_share":
+                lines.append(f"white_share = {float(f'{1.0 - each.value:.3g}')!r}")
     return "\n\n".join("\n".join((f"[fusion.{section}]", *lines)) for section, lines in sections.items())
 
 
