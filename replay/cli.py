@@ -14,6 +14,7 @@ from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
+from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
 from sensors.errors import EgolocError
 
@@ -26,6 +27,8 @@ COMMANDS = {
     "score": Score,
     "compare": Compare,
     "view": View,
+    "allan": Allan,
+    "noise": Noise,
 }
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."
 BENCH_DESCRIPTION = "Measure speed beside other libraries, and how well the filter does where it is hard."

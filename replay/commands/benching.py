@@ -165,6 +165,31 @@ class BenchHidden:
         _printed("hidden", work, hidden_table, self.json)
 
 
+@dataclass(frozen=True)
+class BenchConsistency:
+    """Whether the filter's sigmas are honest: NEES of simulated drives, and P over a day."""
+
+    seeds: int = 200
+    """Simulated drives of each case."""
+    config: Annotated[
+        Path | None, tyro.conf.arg(metavar="FILE.toml", help_behavior_hint="(default: the default configuration)")
+    ] = None
+    """How drives whose errors last are filtered."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import consistency
+        from replay.config import load_config
+
+        if self.seeds < 1:
+            raise EgolocError(f"--seeds: expected 1 or more, got {self.seeds}")
+        config = None if self.config is None else load_config(self.config).fusion
+        work = lambda tell: consistency.run(self.seeds, config=config, watch=tell)  # noqa: E731
+        _printed("consistency", work, consistency.table, self.json)
+
+
 BENCHMARKS = {
     "filter": BenchFilter,
     "live": BenchLive,
@@ -173,6 +198,7 @@ BENCHMARKS = {
     "gates": BenchGates,
     "faults": BenchFaults,
     "hidden": BenchHidden,
+    "consistency": BenchConsistency,
 }
 
 

@@ -54,7 +54,7 @@ class Simulate:
     """Write a simulated drive as an MCAP log."""
 
     scenario: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENARIO")]
-    """A scenario of the package (demo, clean, road-test) or a TOML file with one."""
+    """A scenario of the package (demo, clean, road-test, static) or a TOML file with one."""
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
     """The log to write; it must not exist yet."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: the scenario's)")] = None
