@@ -107,7 +107,7 @@ def start_again(core: Core, par: Parameters, now: int) -> None:
     dx[3], dx[4], dx[5] = doubt[0, 6], doubt[0, 7], -nav[5]
     inject(nav, core.earth, dx)
     refresh(nav, core.earth)
-    nav[6], nav[7], nav[8], nav[9] = _levelled(_mean_force(core, par.still_window_ns, now), yaw)
+    nav[6], nav[7], nav[8], nav[9] = levelled(_mean_force(core, par.still_window_ns, now), yaw)
     for i in range(10, 16):
         nav[i] = 0.0
     for i in range(3):
@@ -134,7 +134,7 @@ def _mean_force(core: Core, window_ns: int, now: int) -> Vector:
 
 
 @kernel()
-def _levelled(force: Vector, yaw: float) -> Quaternion:
+def levelled(force: Vector, yaw: float) -> Quaternion:
     """q_enu_body with the force upwards and a yaw from east."""
     x, y, z = force
     roll, pitch = math.atan2(y, z), math.atan2(-x, math.hypot(y, z))

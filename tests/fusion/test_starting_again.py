@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusion.recovery import _levelled
+from fusion.giving_way import levelled
 from fusion.result import Reason, Sensor
 from fusion.run import run
 from sensors.records import Imu, Log
@@ -76,5 +76,5 @@ def test_a_height_that_runs_away_is_brought_back(drive: Drive) -> None:
 def test_levelled_by_gravity(roll: float, pitch: float, yaw: float) -> None:
     q = q_from_rpy(roll, pitch, yaw)[0]
     force = rotate(np.array([[-q[0], -q[1], -q[2], q[3]]]), np.array([[0.0, 0.0, 9.8]]))[0]
-    found = np.array(_levelled(tuple(force), yaw))
+    found = np.array(levelled(tuple(force), yaw))
     np.testing.assert_allclose(found * np.sign(found[3]), q * np.sign(q[3]), atol=1e-12)
