@@ -3,12 +3,15 @@
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fusion.baselines import Fix, enu_between, moved, over_best_baseline
 from fusion.config import FusionConfig
 from fusion.events import Measurements, Parameters
+from fusion.inheritance import inherit_gnss, inherit_pose
+from fusion.layout import prior_variances
 from fusion.levelling import ImuColumns, Rest, Window, level, window_before
 from fusion.result import Sensor
 from fusion.state import (
@@ -18,7 +21,6 @@ from fusion.state import (
     E_POSITION,
     E_VELOCITY,
     E_WHEEL_SCALE,
-    ERROR_SIZE,
     GYRO_BIAS,
     LLH,
     NAV_SIZE,
@@ -49,13 +51,20 @@ Yaw = tuple[float, float]
 """From east, rad, and its variance."""
 Velocity = tuple[Floats, Floats]
 """ENU (3,) m/s and its covariance."""
-Place = tuple[Floats, Floats, Floats]
-"""llh (3,) of a point of the vehicle, its ENU covariance, and that point's lever arm."""
+
+
+class Place(NamedTuple):
+    """llh (3,) of a point of the vehicle, its ENU covariance, that point's lever arm, and the sensor that shows it."""
+
+    llh: Floats
+    cov: Floats
+    arm: Floats
+    sensor: Sensor
 
 
 @dataclass(frozen=True)
 class Initial:
-    """First state: t_ns, nav (17,), P (16, 16) and the sensor whose measurement completed it."""
+    """First state: t_ns, nav (17,), P (n, n) and the sensor whose measurement completed it."""
 
     t_ns: int
     nav: Floats
@@ -69,6 +78,7 @@ class Aligner:
     def __init__(self, vehicle: Vehicle, config: FusionConfig, par: Parameters) -> None:
         self._vehicle, self._config, self._par = vehicle, config.alignment, par
         self._wheel_scale_var = config.motion.wheel_scale_sigma**2
+        self._priors = prior_variances(vehicle, config)
         self._positions: deque[Fix] = deque(maxlen=_KEPT)
         self._velocities: deque[Fix] = deque(maxlen=_KEPT)
         self._poses: deque[Fix] = deque(maxlen=_KEPT)
@@ -99,7 +109,12 @@ class Aligner:
         if place is None:
             return None
         acceleration = (np.zeros(3), 0.0) if still else self._acceleration(t_ns, window)
-        return Initial(t_ns, *self._state(yaw, velocity, place, window, acceleration), Sensor(sensor))
+        nav, P = self._state(yaw, velocity, place, window, acceleration)
+        if place.sensor == Sensor.POSE_FIX:
+            inherit_pose(P, self._poses[-1], self._par, yaw_too=sensor == Sensor.POSE_FIX)
+        else:
+            inherit_gnss(P, self._positions[-1], self._par)
+        return Initial(t_ns, nav, P, Sensor(sensor))
 
     def _take(self, t_ns: int, sensor: int, row: int, m: Measurements) -> None:
         if sensor == Sensor.GNSS_POSITION:
@@ -213,7 +228,8 @@ class Aligner:
             return None
         age = (t_ns - fix.t_ns) * 1e-9
         cov = fix.cov + np.eye(3) * (1.0 * age) ** 2
-        return moved(fix.value, velocity * age), cov, np.array(self._vehicle.gnss_lever_arm)
+        arm = np.array(self._vehicle.gnss_lever_arm)
+        return Place(moved(fix.value, velocity * age), cov, arm, Sensor.GNSS_POSITION)
 
     def _pose_place(self, t_ns: int, pose: Fix, fix: Fix | None) -> Place:
         """A pose fix's place, with its height from GNSS."""
@@ -222,7 +238,7 @@ class Aligner:
         if fix is not None and t_ns - fix.t_ns <= 10e9:
             llh[2] = fix.value[2] - self._vehicle.gnss_lever_arm[2] + self._vehicle.pose_lever_arm[2]
             cov[2, 2] = fix.cov[2, 2] + 0.3**2
-        return llh, cov, np.array(self._vehicle.pose_lever_arm)
+        return Place(llh, cov, np.array(self._vehicle.pose_lever_arm), Sensor.POSE_FIX)
 
     def _acceleration(self, t_ns: int, window: Window) -> tuple[Floats, float]:
         """ENU acceleration (3,) over the window, and the sigma of its horizontal axes, m/s^2.
@@ -240,8 +256,8 @@ class Aligner:
     def _state(
         self, yaw: Yaw, velocity: Velocity, place: Place, window: Window, acceleration: tuple[Floats, float]
     ) -> tuple[Floats, Floats]:
-        """nav (17,) and P (16, 16)."""
-        llh, place_cov, arm = place
+        """nav (17,) and P (n, n)."""
+        llh, arm = place.llh, place.arm
         roll, pitch, tilt_sigma = level(window, *acceleration, yaw[0], float(llh[0]), float(llh[2]))
         level_sigma = math.hypot(math.radians(self._config.level_sigma_deg), tilt_sigma)
         q = q_from_rpy(roll, pitch, yaw[0])[0]
@@ -250,8 +266,8 @@ class Aligner:
         nav[LLH], nav[VELOCITY], nav[QUATERNION] = moved(llh, -(R @ arm)), velocity[0], q
         nav[GYRO_BIAS], bias_sigma = self._rest.gyro_bias(self._vehicle.imu, self._par, R, float(llh[0]))
         reach = np.linalg.norm(arm)
-        P = np.zeros((ERROR_SIZE, ERROR_SIZE))
-        P[E_POSITION, E_POSITION] = place_cov + np.eye(3) * (reach * level_sigma) ** 2
+        P = np.diag(self._priors)
+        P[E_POSITION, E_POSITION] = place.cov + np.eye(3) * (reach * level_sigma) ** 2
         P[E_VELOCITY, E_VELOCITY] = velocity[1] + np.eye(3) * (np.linalg.norm(window.rate) * reach) ** 2
         P[E_ATTITUDE, E_ATTITUDE] = np.diag([level_sigma**2, level_sigma**2, yaw[1]])
         P[E_GYRO_BIAS, E_GYRO_BIAS] = np.eye(3) * bias_sigma**2

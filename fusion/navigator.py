@@ -11,13 +11,13 @@ from fusion.config import FusionConfig
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder, new_recorder
 from fusion.health import begin
 from fusion.history import read_only
-from fusion.layout import prior_variances, used
+from fusion.layout import used
 from fusion.mechanization import refresh
 from fusion.recording import decisions, join, states, unused
 from fusion.result import Decisions, Reason, Restart, States
 from fusion.sources import APPLY, RECORDS, Sources, joined, parts, sources, split
 from fusion.spikes import SpikeGate
-from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, ERROR_SIZE, H_CAUSE, NAV_SIZE, Core, Floats, new_core
+from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, H_CAUSE, NAV_SIZE, Core, new_core
 from fusion.tape import Tape, portions
 from fusion.timeline import merge, parameters
 from sensors import pieces
@@ -46,7 +46,6 @@ class Navigator:
         what alignment itself looks back on: only measurements that come late need more. tape: for the smoother."""
         self._empty = Log(vehicle=vehicle, map_frame=map_frame)
         self._config, self._par = config, parameters(vehicle, config)
-        self._priors = prior_variances(vehicle, config)
         self.state_count = used(self._par.layout)
         self._aligner = self._new_aligner()
         self._tape = tape
@@ -167,7 +166,7 @@ class Navigator:
         if len(early.t_ns):
             self._decisions.append(unused(early, Reason.BEFORE_ALIGNMENT, initial))
         if initial is not None:
-            self.core = start(initial, imu, self._priors)
+            self.core = start(initial, imu)
             begin(self.core, initial.t_ns, self._diverged)
             self.aligned_ns = initial.t_ns if self.aligned_ns is None else self.aligned_ns
         return self.core
@@ -196,19 +195,14 @@ class Navigator:
         return False
 
 
-def start(initial: Initial, imu: Imu, priors: Floats | None = None) -> Core:
-    """A core at the first state, with the IMU sample at or before it as the last one.
-
-    priors: (n,) variances of the blocks (``fusion.layout``); without them there are none.
-    """
-    core = new_core(ERROR_SIZE if priors is None else len(priors))
+def start(initial: Initial, imu: Imu) -> Core:
+    """A core at the first state, with the IMU sample at or before it as the last one."""
+    core = new_core(len(initial.P))
     before = int(np.searchsorted(imu.t_ns, initial.t_ns, side="right")) - 1
     core.clock[C_STATE] = initial.t_ns
     core.clock[C_SAMPLE] = imu.t_ns[before]
     core.clock[C_TICK] = initial.t_ns
-    if priors is not None:
-        np.fill_diagonal(core.P, priors)
-    core.nav[:NAV_SIZE], core.P[:ERROR_SIZE, :ERROR_SIZE] = initial.nav, initial.P
+    core.nav[:NAV_SIZE], core.P[:] = initial.nav, initial.P
     refresh(core.nav, core.earth)
     core.last[0, :3], core.last[0, 3:] = imu.gyro[before], imu.accel[before]
     if before > 0:

@@ -195,7 +195,7 @@ class RewindingNavigator(Navigator):
     def _begin(self, initial: Initial, imu: Imu, silent_ns: int) -> None:
         """Begin with a first state; silent_ns: states up to this time were not known when the clock read it."""
         length_s = self._config.history_s
-        core = start(initial, imu, self._priors)
+        core = start(initial, imu)
         begin(core, initial.t_ns, None)
         self.core, self.aligned_ns = with_snapshots(core, length_s), initial.t_ns
         self._columns = columns_for(self._nothing.measurements, length_s)
