@@ -38,6 +38,8 @@ class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     noise_scale: NonNegative = 2.0
     """White noise of gyro and accelerometer, times the datasheet's (vibration, quantization), -."""
+    temperature_walk_k: NonNegative = 0.2
+    """How the IMU's temperature changes, which moves its biases: random walk, K/sqrt(s)."""
     spike_rate_deg: Positive = 30.0
     """A rate that differs by more from the sample before and the one after is a spike, and not used, deg/s."""
     spike_force: Positive = 50.0

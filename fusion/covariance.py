@@ -19,14 +19,18 @@ class Noise(NamedTuple):
     """Process noise: gyro (rad/s)^2/Hz, accelerometer (m/s^2)^2/Hz; variances and 1/tau (1/s) of drifting biases.
 
     A bias is a turn-on constant, which nothing but measurements makes known, plus a Gauss-Markov drift. One state holds
-    both: a random walk with the drift's driving noise, 2 var / tau, so that sigma never falls by waiting.
+    both: a random walk with the drift's driving noise, 2 var / tau, so that sigma never falls by waiting. What the
+    temperature does to it is added: it warms up for minutes, and no constant.
     """
 
     gyro_psd: float
     accel_psd: float
     gyro_bias_var: float
-    accel_bias_var: float
-    bias_rate: float
+    """Of the drift, (rad/s)^2."""
+    gyro_bias_rate: float
+    """Growth of its variance, (rad/s)^2/s."""
+    accel_bias_rate: float
+    """The same of the accelerometer bias, (m/s^2)^2/s."""
     wheel_scale_rate: float
     """Growth of the wheel scale's variance, 1/s."""
     gyro_scale: int = -1
@@ -164,15 +168,15 @@ def propagate(
 @kernel()
 def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float) -> None:
     """Q of white noise integrated over the span (van Loan's integral, to the leading order of each block)."""
-    qa, qg, drift = noise.accel_psd * span, noise.gyro_psd * span, 2.0 * noise.bias_rate * span
+    qa, qg = noise.accel_psd * span, noise.gyro_psd * span
     for i in range(3):
         P[i, i] += qa * span * span / 3.0
         P[i, 3 + i] += 0.5 * qa * span
         P[3 + i, i] += 0.5 * qa * span
         P[3 + i, 3 + i] += qa
         P[6 + i, 6 + i] += qg
-        P[9 + i, 9 + i] += noise.gyro_bias_var * drift
-        P[12 + i, 12 + i] += noise.accel_bias_var * drift
+        P[9 + i, 9 + i] += noise.gyro_bias_rate * span
+        P[12 + i, 12 + i] += noise.accel_bias_rate * span
     P[E_WHEEL_SCALE, E_WHEEL_SCALE] += noise.wheel_scale_rate * span
     # velocity against attitude: -[s]x qg / 2
     half = 0.5 * qg

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from fusion.config import KERNELS, FusionConfig, check
+from fusion.config import KERNELS, FusionConfig, ImuNoise, check
 from fusion.covariance import Noise
 from fusion.divergence import HealthLimits
 from fusion.events import MOTION, OUTPUT, Events, Parameters
@@ -21,22 +21,25 @@ from sensors.vehicle import ImuSpec, Vehicle
 STANDARD_GRAVITY = 9.80665
 
 _ROOT_HOUR = 60.0
-_DEG_PER_H = np.pi / 180.0 / 3600.0
+_DEG_PER_H = math.pi / 180.0 / 3600.0
+_MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 
-def noise_of(spec: ImuSpec, scale: float, wheel_scale_walk: float = 0.0) -> Noise:
-    """Process noise per second from datasheet units; scale multiplies the white noise's standard deviation.
-
-    wheel_scale_walk: 1/sqrt(h).
-    """
-    gyro = np.radians(spec.gyro_noise_deg_per_sqrt_h) / _ROOT_HOUR * scale
-    accel = spec.accel_noise_m_per_s_per_sqrt_h / _ROOT_HOUR * scale
+def noise_of(spec: ImuSpec, model: ImuNoise, wheel_scale_walk: float = 0.0) -> Noise:
+    """Process noise per second from datasheet units. wheel_scale_walk: 1/sqrt(h)."""
+    gyro = math.radians(spec.gyro_noise_deg_per_sqrt_h) / _ROOT_HOUR * model.noise_scale
+    accel = spec.accel_noise_m_per_s_per_sqrt_h / _ROOT_HOUR * model.noise_scale
+    gyro_bias_var = (spec.gyro_bias_instability_deg_per_h * _DEG_PER_H) ** 2
+    accel_bias_var = (spec.accel_bias_instability_mg * _MILLI_G) ** 2
+    gyro_warmth = spec.gyro_bias_deg_per_h_per_k * _DEG_PER_H * model.temperature_walk_k
+    accel_warmth = spec.accel_bias_mg_per_k * _MILLI_G * model.temperature_walk_k
+    decay = 2.0 / spec.bias_time_constant_s
     return Noise(
-        gyro_psd=float(gyro**2),
-        accel_psd=float(accel**2),
-        gyro_bias_var=float((spec.gyro_bias_instability_deg_per_h * _DEG_PER_H) ** 2),
-        accel_bias_var=float((spec.accel_bias_instability_mg * 1e-3 * STANDARD_GRAVITY) ** 2),
-        bias_rate=1.0 / spec.bias_time_constant_s,
+        gyro_psd=gyro**2,
+        accel_psd=accel**2,
+        gyro_bias_var=gyro_bias_var,
+        gyro_bias_rate=gyro_bias_var * decay + gyro_warmth**2,
+        accel_bias_rate=accel_bias_var * decay + accel_warmth**2,
         wheel_scale_rate=wheel_scale_walk**2 / 3600.0,
     )
 
@@ -48,7 +51,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
     never = (math.inf, math.inf, math.inf)
     inflation = math.sqrt(pose.inflation)
     layout = layout_of(vehicle, config)
-    noise = noise_of(vehicle.imu, config.imu.noise_scale, motion.wheel_scale_walk if motion.wheel else 0.0)
+    noise = noise_of(vehicle.imu, config.imu, motion.wheel_scale_walk if motion.wheel else 0.0)
     noise = noise._replace(gyro_scale=layout.gyro_scale, gyro_misalignment=layout.gyro_misalignment)
     return Parameters(
         noise=noise,

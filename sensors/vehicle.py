@@ -27,6 +27,10 @@ class ImuSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Standard deviation of the gyro's scale error about the vertical axis: a state; 0: none, ppm."""
     gyro_misalignment_deg: NonNegative = 0.0
     """Standard deviation of how far its other axes see the yaw rate: states beside the scale error, deg."""
+    gyro_bias_deg_per_h_per_k: NonNegative = 0.0
+    """How the gyro bias changes with temperature (standard deviation), deg/h/K."""
+    accel_bias_mg_per_k: NonNegative = 0.0
+    """The same of the accelerometer bias, milli-g/K."""
     bias_time_constant_s: Positive = 1000.0
     """Correlation time of both drifting biases, s."""
     gyro_turn_on_bias_deg_per_h: NonNegative = 360.0

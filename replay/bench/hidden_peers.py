@@ -64,7 +64,7 @@ class PeerLog:
     @cached_property
     def bias_walk(self) -> tuple[float, float]:
         """Variance per second of the drifting gyro and accelerometer biases."""
-        return 2 * self.noise.bias_rate * self.noise.gyro_bias_var, 2 * self.noise.bias_rate * self.noise.accel_bias_var
+        return self.noise.gyro_bias_rate, self.noise.accel_bias_rate
 
 
 def peer_log(log: Log, config: FusionConfig) -> PeerLog:
@@ -87,7 +87,7 @@ def peer_log(log: Log, config: FusionConfig) -> PeerLog:
         _values(found, Sensor.WHEEL, m.wheel[:, None], m.wheel_var[:, None, None]),
         np.array(log.vehicle.gnss_lever_arm),
         np.array(log.vehicle.rear_axle),
-        noise_of(log.vehicle.imu, config.imu.noise_scale),
+        noise_of(log.vehicle.imu, config.imu),
         result.states,
         decided.t_ns[rested],
         begin,

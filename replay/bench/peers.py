@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.config import ImuNoise
 from fusion.covariance import Noise
 from fusion.timeline import noise_of
 from sensors.geodesy import enu_from_llh, llh_from_map, rotation_map_enu
@@ -48,7 +49,7 @@ class PeerDrive:
 
     def bias_walk(self) -> tuple[float, float]:
         """Variance per second of the drifting gyro and accelerometer biases."""
-        return 2 * self.noise.bias_rate * self.noise.gyro_bias_var, 2 * self.noise.bias_rate * self.noise.accel_bias_var
+        return self.noise.gyro_bias_rate, self.noise.accel_bias_rate
 
 
 def peer_drive(seconds: float) -> PeerDrive:
@@ -78,7 +79,7 @@ def flat(drive: Drive) -> PeerDrive:
         pose=pose,
         pose_cov=log.pose_fixes.cov,
         arm=np.array(log.vehicle.gnss_lever_arm),
-        noise=noise_of(log.vehicle.imu, 1.0),
+        noise=noise_of(log.vehicle.imu, ImuNoise(noise_scale=1.0)),
         truth=enu_from_llh(drive.truth.at(log.gnss.t_ns).llh, datum),
     )
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion.config import FusionConfig
+from fusion.config import FusionConfig, ImuNoise
 from fusion.covariance import Noise, coast, propagate, transition
 from fusion.events import OUTPUT
 from fusion.filter import Localizer
@@ -33,7 +33,7 @@ from tests.fusion.scenes import with_gap
 
 SIGMAS = np.append(np.repeat([1.0, 0.1, 0.02, 1e-4, 0.05], 3), 0.01)
 NOISE = Noise(
-    gyro_psd=1e-6, accel_psd=1e-4, gyro_bias_var=1e-8, accel_bias_var=1e-6, bias_rate=0.01, wheel_scale_rate=1e-7
+    gyro_psd=1e-6, accel_psd=1e-4, gyro_bias_var=1e-8, gyro_bias_rate=2e-10, accel_bias_rate=2e-8, wheel_scale_rate=1e-7
 )
 
 
@@ -49,7 +49,7 @@ def plain(P: Floats, phi: Floats, force: Floats, span: float, noise: Noise) -> F
     Q[E_ATTITUDE, E_ATTITUDE] = np.eye(3) * qg
     Q[E_VELOCITY, E_ATTITUDE] = minus_skew * qg / 2
     Q[E_ATTITUDE, E_VELOCITY] = minus_skew.T * qg / 2
-    Q[9:15, 9:15] = np.diag(np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3)) * 2 * noise.bias_rate * span
+    Q[9:15, 9:15] = np.diag(np.repeat([noise.gyro_bias_rate, noise.accel_bias_rate], 3)) * span
     Q[E_WHEEL_SCALE, E_WHEEL_SCALE] = noise.wheel_scale_rate * span
     result: Floats = phi @ P @ phi.T + Q
     return result
@@ -89,7 +89,7 @@ def van_loan(F: Floats, G: Floats, span: float) -> Floats:
 
 def test_process_noise_is_the_integral_of_white_noise() -> None:
     """Each block of Q against van Loan's integral for a constant force; the leading order is what is kept."""
-    span, f, noise = 0.1, np.array([1.0, -2.0, 9.8]), noise_of(Vehicle().imu, 1.0)
+    span, f, noise = 0.1, np.array([1.0, -2.0, 9.8]), noise_of(Vehicle().imu, ImuNoise(noise_scale=1.0))
     F = np.zeros((9, 9))
     F[0:3, 3:6] = np.eye(3)
     F[3:6, 6:9] = [[0, f[2], -f[1]], [-f[2], 0, f[0]], [f[1], -f[0], 0]]
@@ -216,7 +216,7 @@ def test_events_inside_a_bridged_gap_hardly_change_where_it_ends() -> None:
 
 def test_noise_scale_multiplies_the_white_noise_only() -> None:
     spec = Vehicle().imu
-    one, two = noise_of(spec, 1.0), noise_of(spec, 2.0)
+    one, two = (noise_of(spec, ImuNoise(noise_scale=scale)) for scale in (1.0, 2.0))
     assert two.gyro_psd == pytest.approx(4 * one.gyro_psd)
     assert two.accel_psd == pytest.approx(4 * one.accel_psd)
     assert two[2:] == one[2:]
@@ -232,6 +232,6 @@ def test_waiting_makes_no_bias_known() -> None:
     imu = exact_imu(truth, t, vehicle)
     core = core_at(nav_of(truth.at(t[:1])), imu, np.diag(SIGMAS**2))
     go(core, imu, vehicle)
-    noise = noise_of(vehicle.imu, FREE.imu.noise_scale)
-    grown = SIGMAS[9:15] ** 2 + np.repeat([noise.gyro_bias_var, noise.accel_bias_var], 3) * 2 * 600 * noise.bias_rate
+    noise = noise_of(vehicle.imu, FREE.imu)
+    grown = SIGMAS[9:15] ** 2 + np.repeat([noise.gyro_bias_rate, noise.accel_bias_rate], 3) * 600
     assert np.diag(core.P)[9:15] == pytest.approx(grown, rel=1e-9)

@@ -45,7 +45,7 @@ POSITION_SIGMA, VELOCITY_SIGMA = 1e-4, 1e-4
 
 def step(core: Core, vehicle: Vehicle) -> tuple[Floats, Floats]:
     """Phi and Q (16, 16) over what the core has accumulated, in plain numpy; the core's P goes along."""
-    noise = noise_of(vehicle.imu, CONFIG.imu.noise_scale)
+    noise = noise_of(vehicle.imu, CONFIG.imu)
     span, upper = float(core.span[0]), np.zeros((9, ROW))
     transition(core.nav, core.earth, core.acc, span, upper)
     phi = np.eye(ERROR_SIZE)

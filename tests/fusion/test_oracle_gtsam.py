@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fusion.config import Gates
+from fusion.config import Gates, ImuNoise
 from fusion.state import ERROR_SIZE
 from fusion.timeline import noise_of
 from sensors._kernels import EARTH_RATE, gravity_enu
@@ -46,7 +46,7 @@ def smoothed(gtsam: Any, log: Log, nav: Floats) -> Floats:
     assert log.imu is not None
     assert log.gnss is not None
     X, V, B = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B
-    noise = noise_of(log.vehicle.imu, 1.0)
+    noise = noise_of(log.vehicle.imu, ImuNoise(noise_scale=1.0))
     lat, height = float(nav[0]), float(nav[2])
     north, up = gravity_enu(np.sin(lat), np.cos(lat), height)
     params = gtsam.PreintegrationParams(np.array([0.0, north, up]))
@@ -56,7 +56,7 @@ def smoothed(gtsam: Any, log: Log, nav: Floats) -> Floats:
     params.setOmegaCoriolis(np.array([0.0, EARTH_RATE * np.cos(lat), EARTH_RATE * np.sin(lat)]))
     sigmas = gtsam.noiseModel.Diagonal.Sigmas
     step_s = 0.1
-    drift = np.sqrt(2 * noise.bias_rate * step_s * np.repeat([noise.accel_bias_var, noise.gyro_bias_var], 3))
+    drift = np.sqrt(step_s * np.repeat([noise.accel_bias_rate, noise.gyro_bias_rate], 3))
     walk = sigmas(drift)
 
     options = gtsam.ISAM2Params()
