@@ -99,7 +99,7 @@ def sweep(
                 continue
             if e >= events or ev.t[e] > stop:
                 break
-            if not keeps and gives_up(core, par, ev, e, stop):
+            if gives_up(core, par, ev, e, stop):
                 return e
             rate = blend(interval[0], interval[1], (stop - start) / whole) if whole > 0 else w
             guess = gap

@@ -36,7 +36,7 @@ from fusion.history import (
 )
 from fusion.result import Reason
 from fusion.snapshots import S_FIRST, S_NEWEST, restore, snapshot_before
-from fusion.state import C_COUNT, C_STATE, Core, Floats, Nanoseconds
+from fusion.state import C_COUNT, C_SAMPLE, C_STATE, Core, Floats, Nanoseconds
 from fusion.update import record_decision
 from sensors.kernel import kernel
 
@@ -61,17 +61,19 @@ def arrive(
     par: Parameters,
     rec: Recorder,
     stamps: NDArray[np.int64],
-) -> None:
+) -> tuple[int, int, bool]:
     """Take IMU samples and the first ``count`` measurements of the inbox, both sorted by when they are due.
 
     Of what is due at the same time measurements come first, and share a rewind. stamps (M, 3): time, arrival and log
-    row of each recorded decision.
+    row of each recorded decision. Returns how many samples and measurements were taken, and whether the filter has
+    given up: at a position that finds it hopeless it stays, with the samples that had arrived by then in the ring and
+    the events not met in the history; nothing else is taken.
     """
     mark, inbox, samples = history.mark, history.inbox, len(imu_t)
     i = j = 0
     while i < samples or j < count:
         due = inbox[j, I_DUE] if j < count else FOREVER
-        begin = i
+        begin, before = i, mark[M_SAMPLES]
         while i < samples and imu_due[i] < due and i - begin < PLAYED:
             _load(history, imu_t[i], gyro, accel, i)
             i += 1
@@ -88,8 +90,21 @@ def arrive(
                 continue
             _rewind(core, history, earliest)
         _play(core, history, par, rec, stamps)
+        if _stuck(core, history, mark[M_NEXT]):
+            # the sample that reached this time had arrived, and none after it
+            arrived = max(before, core.clock[C_COUNT] + int(core.clock[C_SAMPLE] < core.clock[C_STATE]))
+            i -= mark[M_SAMPLES] - arrived
+            mark[M_SAMPLES] = arrived
+            return i, j, True
     while mark[M_FREE] < NEW:
         _make_room(core, history, rec, stamps)
+    return i, j, False
+
+
+@kernel(inline="always")
+def _stuck(core: Core, history: History, e: int) -> bool:
+    """Whether event e, the first not met, is not met although the state has reached it: the filter has given up."""
+    return bool(e < history.mark[M_EVENTS] and history.events.t[e] <= core.clock[C_STATE])
 
 
 @kernel(inline="always")
@@ -134,6 +149,8 @@ def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: 
         end = min(begin + mark[M_SAMPLES] - core.clock[C_COUNT], size)
         t, gyro, accel = played.t[begin:end], played.gyro[begin:end], played.accel[begin:end]
         met = sweep(core, t, gyro, accel, events, met, history.m, par, rec, True)
+        if _stuck(core, history, met):
+            break
     for k in range(decided, rec.filled[1]):
         e = rec.event[k]
         stamps[k, 0], stamps[k, 1], stamps[k, 2] = every.t[e], history.arrival_ns[e], history.log_row[e]
@@ -241,7 +258,7 @@ def _make_room(core: Core, history: History, rec: Recorder, stamps: Nanoseconds)
             break
         core.saves[S_FIRST] += 1
     for e in range(met, count):
-        if events.kind[e] < MOTION:
+        if events.kind[e] < MOTION and events.verdict[e] != AGAIN:
             k = record_decision(rec, -1, events.kind[e], 0, _OUTSIDE_IMU)
             stamps[k, 0], stamps[k, 1], stamps[k, 2] = events.t[e], history.arrival_ns[e], history.log_row[e]
     mark[M_NEXT] = max(mark[M_NEXT], count)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from fusion.config import FusionConfig
 from fusion.covariance import propagate
 from fusion.navigator import Navigator
-from fusion.result import Decisions, States
+from fusion.result import Decisions, Restart, States
 from fusion.rewinding import RewindingNavigator
 from fusion.state import ACCEL_BIAS, C_STATE, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core, Floats
 from fusion.timeline import parameters
@@ -92,6 +92,10 @@ class Localizer:
         P, scratch = core.P.copy(), (core.phi, core.M, core.Mt)
         propagate(core.nav, core.earth, P, core.acc.copy(), core.span.copy(), scratch, self._noise)
         return P[: self._navigator.state_count, : self._navigator.state_count]
+
+    def take_restarts(self) -> tuple[Restart, ...]:
+        """Divergences since the last call after which alignment began anew."""
+        return self._navigator.take_restarts()
 
     def take_states(self) -> States:
         """States recorded since the last call."""

@@ -8,10 +8,11 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.events import Events, Measurements
+from fusion.events import MOTION, Events, Measurements
 from fusion.sources import Sources, put
 from fusion.state import Floats, Nanoseconds
 from sensors.clock import NS_PER_S
+from sensors.records import Imu
 
 Code = TypeVar("Code", np.int8, np.int64)
 Number = TypeVar("Number", np.int64, np.float64)
@@ -115,18 +116,19 @@ def enter(history: History, columns: Measurements, found: Sources, due: Nanoseco
     return count
 
 
-def waiting(history: History, nothing: Sources) -> Sources:
-    """The measurements that the IMU has not reached, without their numbers."""
-    rows, e = slice(int(history.mark[M_NEXT]), int(history.mark[M_EVENTS])), history.events
-    return Sources(
-        nothing.measurements,
-        e.t[rows].copy(),
-        history.arrival_ns[rows].copy(),
-        e.kind[rows].copy(),
-        e.row[rows].copy(),
-        history.log_row[rows].copy(),
-        e.verdict[rows].copy(),
-    )
+def waiting(history: History) -> Sources:
+    """The measurements that are not met: the IMU has not reached them, or the filter gave up at the first of them."""
+    first, e = int(history.mark[M_NEXT]), history.events
+    rows = first + np.flatnonzero(e.kind[first : int(history.mark[M_EVENTS])] < MOTION)
+    stamps = e.t[rows], history.arrival_ns[rows], e.kind[rows], e.row[rows], history.log_row[rows], e.verdict[rows]
+    return Sources(history.m, *stamps)
+
+
+def unplayed(history: History, played: int) -> Imu:
+    """The samples in the ring after so many that were played."""
+    ring = history.samples
+    k = np.arange(played, history.mark[M_SAMPLES]) & (len(ring.t) - 1)
+    return Imu(ring.t[k], ring.t[k], ring.gyro[k], ring.accel[k])
 
 
 def with_room(history: History, more: int) -> History:

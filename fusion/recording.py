@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.alignment import Initial
-from fusion.events import Recorder
+from fusion.events import AGAIN, Recorder
 from fusion.result import Decisions, Reason, States
 from fusion.sources import APPLY, Sources
 from fusion.state import ACCEL_BIAS, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Floats, Nanoseconds
@@ -64,7 +64,11 @@ def decided(rec: Recorder, t_ns: Nanoseconds, arrival_ns: Nanoseconds, log_row: 
 
 
 def unused(found: Sources, reason: Reason, initial: Initial | None = None) -> Decisions:
-    """Decisions for measurements that never reached the kernel; the one that completed alignment says so."""
+    """Decisions for measurements that never reached the kernel; the one that completed alignment says so.
+
+    Those that did reach it before the filter gave up (AGAIN) have been decided.
+    """
+    found = found.chosen(np.flatnonzero(found.verdict != AGAIN))
     n = len(found.t_ns)
     nothing: Floats = np.full(n, np.nan)
     reasons: NDArray[np.int8] = np.where(found.verdict == APPLY, np.int8(reason), found.verdict).astype(np.int8)

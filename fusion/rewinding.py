@@ -2,6 +2,9 @@
 
 A row is due when it arrived, by the clock of the stamps: if the IMU's first sample seems to arrive before its stamp, or
 more than a second after it, the clocks differ by that much. Nothing is due before it was true.
+
+Where the filter gives up, samples and measurements that it has not met wait once more, for another first state. That is
+final: a measurement from before it is too late, whatever it would have changed.
 """
 
 import numpy as np
@@ -28,6 +31,7 @@ from fusion.history import (
     enter,
     new_history,
     read_only,
+    unplayed,
     waiting,
     with_room,
 )
@@ -36,8 +40,8 @@ from fusion.navigator import FOREVER, NEVER, Navigator, start
 from fusion.recording import unused
 from fusion.result import Decisions, Reason, States
 from fusion.snapshots import with_snapshots
-from fusion.sources import APPLY, Sources, compact
-from fusion.state import C_STATE, Nanoseconds
+from fusion.sources import Sources, compact, joined
+from fusion.state import C_COUNT, C_STATE, Core, Nanoseconds
 from fusion.timeline import periods
 from sensors import pieces
 from sensors.clock import NS_PER_S
@@ -70,6 +74,8 @@ class RewindingNavigator(Navigator):
         self._last_due = NEVER
         self._seen_ns = NEVER
         """Stamp of the newest sample that alignment has had."""
+        self._since_ns = NEVER
+        """When the filter gave up last."""
         self._offered: dict[int, int] = {}
         """Of each sensor, the newest measurement that alignment has had."""
         self._history: History | None = None
@@ -88,8 +94,7 @@ class RewindingNavigator(Navigator):
         if self._first_imu_ns == imu.t_ns[0]:
             ahead = int(imu.arrival_ns[0] - imu.t_ns[0])
             self._offset_ns = 0 if 0 <= ahead <= NS_PER_S else ahead
-        due = np.maximum.accumulate(np.maximum(imu.arrival_ns - self._offset_ns, imu.t_ns))
-        self._due.append(np.maximum(due, self._last_due))
+        self._due.append(np.maximum.accumulate(np.maximum(self._due_of(imu), self._last_due)))
         self._last_due = int(self._due[-1][-1])
 
     def push(self, piece: Log) -> None:
@@ -103,38 +108,45 @@ class RewindingNavigator(Navigator):
             if self.core is None and len(self.pending.t_ns):
                 self.decide(Reason.BEFORE_ALIGNMENT, int(self.pending.t_ns[-1]) - _WAIT_NS)
             return
-        imu = piece.imu
+        imu, went_on = piece.imu, True
         if imu is not None and len(imu):
             self._check_rising(imu)
-            now = np.zeros(len(imu), np.int64)
-            self._arrive(imu, now, self._nothing, _NO_TIME)
+            went_on = self._arrive(self.spikes.passed(imu), np.zeros(len(imu), np.int64), self._nothing, _NO_TIME)
         for found in self._found(piece):
             for first in range(0, len(found.t_ns), NEW):
                 part = found if len(found.t_ns) <= NEW else found.chosen(slice(first, first + NEW))
-                self._arrive(_NO_IMU, _NO_TIME, part, _NOW)
+                if went_on:
+                    went_on = self._arrive(_NO_IMU, _NO_TIME, part, _NOW)
+                else:
+                    self.pending = joined((self.pending, part))
+        if not went_on:
+            self.advance(FOREVER)
 
     def advance(self, known_ns: int) -> None:
         """Go on with all that is due by known_ns: no row that is due sooner is added later."""
-        if not self._imu and self.core is None:
-            return
-        imu: Imu = pieces.joined(self._imu or [_NO_IMU])
-        imu_due, known_ns = np.concatenate(self._due or [_NO_TIME]), min(known_ns, FOREVER - 1)
-        last = int(np.searchsorted(imu_due, known_ns, side="right"))
-        if self.core is None and not self._start(imu, imu_due, known_ns):
-            if last:
-                self._seen_ns = int(imu.t_ns[last - 1])
-            kept = int(np.searchsorted(imu.t_ns, self._seen_ns - self._kept_ns)) if last else 0
-            self._imu, self._due = [imu[kept:]], [imu_due[kept:]]
-            return
-        self._run(imu[:last], imu_due[:last], known_ns)
-        self._imu, self._due = ([imu[last:]], [imu_due[last:]]) if last < len(imu) else ([], [])
+        known_ns = min(known_ns, FOREVER - 1)
+        while self._imu or self.core is not None:
+            imu: Imu = pieces.joined(self._imu or [_NO_IMU])
+            imu_due = np.concatenate(self._due or [_NO_TIME])
+            last = int(np.searchsorted(imu_due, known_ns, side="right"))
+            if self.core is None and not self._start(imu, imu_due, known_ns):
+                if last:
+                    self._seen_ns = max(self._seen_ns, int(imu.t_ns[last - 1]))
+                kept = int(np.searchsorted(imu.t_ns, self._seen_ns - self._kept_ns)) if last else 0
+                self._imu, self._due = [imu[kept:]], [imu_due[kept:]]
+                return
+            self._imu, self._due = [], []
+            went_on = self._run(imu[:last], imu_due[:last], known_ns)
+            self._wait(imu[last:], imu_due[last:])
+            if went_on:
+                return
 
     def decide(self, reason: Reason, last_ns: int | None = None) -> None:
         """Measurements up to last_ns (None: all) are decided: they are not applied, for this reason."""
         super().decide(reason, last_ns)
         if last_ns is None and self._history is not None:
             self._journal.flush()
-            self._decisions.append(unused(waiting(self._history, self._nothing), reason))
+            self._decisions.append(unused(waiting(self._history), reason))
             self._history.mark[M_EVENTS] = self._history.mark[M_NEXT]
 
     def take_states(self) -> States:
@@ -147,8 +159,14 @@ class RewindingNavigator(Navigator):
         self._journal.flush()
         return super().take_decisions()
 
-    def _due_of(self, found: Sources) -> Nanoseconds:
+    def _due_of(self, found: Sources | Imu) -> Nanoseconds:
         return np.maximum(found.arrival_ns - self._offset_ns, found.t_ns)
+
+    def _wait(self, imu: Imu, imu_due: Nanoseconds) -> None:
+        """Samples that follow those of ``_imu``."""
+        if len(imu):
+            self._imu.append(imu)
+            self._due.append(imu_due)
 
     def _start(self, imu: Imu, imu_due: Nanoseconds, known_ns: int) -> bool:
         """Offer measurements as they can be had, up to known_ns, until one completes a first state.
@@ -159,7 +177,8 @@ class RewindingNavigator(Navigator):
         due = self._due_of(waiting)
         ready, waits = _ready(waiting.t_ns, due, imu.t_ns, imu_due)
         left, _ = _ready(waiting.t_ns + self._history_ns + 1, due, imu.t_ns, imu_due)
-        serving = np.isin(waiting.kind, SERVING) & (waiting.verdict == APPLY) & (waiting.t_ns >= self._first_imu_ns)
+        since_ns = max(self._first_imu_ns, self._since_ns)
+        serving = np.isin(waiting.kind, SERVING) & (waiting.verdict < 0) & (waiting.t_ns >= since_ns)
         order = np.lexsort((waiting.kind, waiting.t_ns, waits, ready))
         initial, now_ns = None, known_ns
         for i in order[(serving & (ready <= known_ns) & (ready < left))[order]]:
@@ -196,8 +215,9 @@ class RewindingNavigator(Navigator):
         """Begin with a first state; silent_ns: states up to this time were not known when the clock read it."""
         length_s = self._config.history_s
         core = start(initial, imu)
-        begin(core, initial.t_ns, None)
-        self.core, self.aligned_ns = with_snapshots(core, length_s), initial.t_ns
+        begin(core, initial.t_ns, self._diverged)
+        self.core = with_snapshots(core, length_s)
+        self.aligned_ns = initial.t_ns if self.aligned_ns is None else self.aligned_ns
         self._columns = columns_for(self._nothing.measurements, length_s)
         self._history = new_history(len(self.core.ring_t), self._columns, length_s)
         mark = self._history.mark
@@ -207,26 +227,30 @@ class RewindingNavigator(Navigator):
             mark[M_TICK_PERIOD], mark[M_TICK] = tick, (initial.t_ns // tick + 1) * tick
         mark[M_START], mark[M_SILENT] = initial.t_ns, max(silent_ns, self._seen_ns)
 
-    def _run(self, imu: Imu, imu_due: Nanoseconds, known_ns: int) -> None:
-        """Give the kernel samples and pending measurements up to known_ns, by when they are due."""
+    def _run(self, imu: Imu, imu_due: Nanoseconds, known_ns: int) -> bool:
+        """Give the kernel samples and pending measurements up to known_ns, by when they are due; False: it gave up."""
         assert self.core is not None
         waiting = self.pending
         due = self._due_of(waiting)
         order = np.lexsort((waiting.kind, waiting.t_ns, due))
         order = order[: int(np.searchsorted(due[order], known_ns, side="right"))]
         begin = int(np.searchsorted(imu.t_ns, self.core.clock[C_STATE], side="right"))
-        for first in range(0, max(len(order), 1), NEW):
-            rows, later = order[first : first + NEW], order[first + NEW : first + NEW + 1]
-            end = int(np.searchsorted(imu_due, due[later[0]])) if len(later) else len(imu)
-            self._arrive(imu[begin:end], imu_due[begin:end], waiting.chosen(rows), due[rows])
-            begin = max(begin, end)
         if len(order):
-            rest = np.ones(len(due), np.bool_)
-            rest[order] = False
-            self.pending = compact(waiting.chosen(np.flatnonzero(rest)))
+            self.pending = compact(waiting.chosen(np.delete(np.arange(len(due)), order)))
+        for first in range(0, max(len(order), 1), NEW):
+            rows, later = order[first : first + NEW], order[first + NEW :]
+            end = int(np.searchsorted(imu_due, due[later[0]])) if len(later) else len(imu)
+            went_on = self._arrive(imu[begin:end], imu_due[begin:end], waiting.chosen(rows), due[rows])
+            begin = max(begin, end)
+            if not went_on:
+                self._wait(imu[begin:], imu_due[begin:])
+                self.pending = joined((self.pending, compact(waiting.chosen(later))))
+                return False
+        return True
 
-    def _arrive(self, imu: Imu, imu_due: Nanoseconds, found: Sources, due: Nanoseconds) -> None:
-        """Run the kernel over samples and at most NEW measurements, both sorted by when they are due."""
+    def _arrive(self, imu: Imu, imu_due: Nanoseconds, found: Sources, due: Nanoseconds) -> bool:
+        """Run the kernel over samples and at most NEW measurements, both sorted by when they are due; False: it gave
+        the state up, and what it did not meet waits."""
         core = self.core
         assert core is not None
         assert self._history is not None
@@ -241,7 +265,30 @@ class RewindingNavigator(Navigator):
             samples = read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel), read_only(imu_due)
         count = enter(self._history, self._columns, found, due)
         rec = self._journal.room(outputs + 1, ticks + count + int(mark[M_EVENTS] - mark[M_NEXT]) + 1)
-        arrive(core, self._history, *samples, count, self._par, rec, self._journal.stamps)
+        i, j, given_up = arrive(core, self._history, *samples, count, self._par, rec, self._journal.stamps)
+        if given_up:
+            self._give_back(core, imu, np.maximum(imu_due, self._due_of(imu)), found, (i, j))
+        return not given_up
+
+    def _give_back(self, core: Core, imu: Imu, imu_due: Nanoseconds, found: Sources, taken: tuple[int, int]) -> None:
+        """Give the state up; what it has not met waits, from its time on. imu, found: of which so many were taken."""
+        assert self._history is not None
+        i, j = taken
+        self._journal.flush()
+        self._give_up(core)
+        self._since_ns = int(core.clock[C_STATE])
+        again = unplayed(self._history, int(core.clock[C_COUNT]))
+        seen_ns = [NEVER, *again.t_ns.tolist()][-1]
+        last_imu, last_found = (int(due[n - 1]) if n else NEVER for due, n in ((imu_due, i), (self._due_of(found), j)))
+        if last_found > last_imu:  # a late one: states over the samples after it are known
+            self._seen_ns = max(self._seen_ns, seen_ns)
+        now_ns = max(last_imu, last_found, seen_ns)
+        self._wait(again, np.full(len(again), now_ns))
+        self._wait(imu[i:], np.maximum.accumulate(np.maximum(imu_due[i:], now_ns)))
+        self._last_due = max(self._last_due, now_ns, *imu_due[i:][-1:].tolist())
+        self.pending = joined((compact(waiting(self._history)), compact(found.chosen(slice(j, None))), self.pending))
+        self._offered.clear()
+        self._history = None
 
     def _most_at_once(self, imu_t: Nanoseconds) -> int:
         """Outputs and motion ticks over the samples that are played at a time."""

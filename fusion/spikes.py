@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.config import ImuNoise
+from fusion.history import read_only
 from fusion.state import Floats, Nanoseconds
 from sensors.kernel import kernel
 from sensors.records import Imu
@@ -34,7 +35,7 @@ class SpikeGate:
     def passed(self, imu: Imu) -> Imu:
         """The record with the values of samples before in place of those held back; itself where there are none."""
         serves = np.empty(len(imu), np.int64)
-        columns = (imu.t_ns, imu.gyro, imu.accel)
+        columns = read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel)
         before = self._values[0].copy()
         found = scan(*columns, self._values, self._clock, self._limits, self._gap_ns, serves)
         if not found:

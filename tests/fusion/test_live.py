@@ -66,6 +66,18 @@ def test_live_equals_the_replay_where_the_imu_comes_late(log: Log) -> None:
     assert_equal_replay(arriving(log, lambda t: np.full(len(t), 30_000_000), ("imu", "pose_fixes")), LATE)
 
 
+def test_live_equals_the_replay_with_spikes_in_the_imu(log: Log) -> None:
+    """They are held back, in a replay and live."""
+    assert log.imu is not None
+    gyro = log.imu.gyro.copy()
+    gyro[[30, 1000, 1700, 1701, 2400]] += 3.0
+    drive = replace(log, imu=replace(log.imu, gyro=gyro))
+    localizer = stream(drive, LATE)[2]
+    assert localizer._navigator.spikes.held_back == 5
+    assert (run(drive, LATE).left_out[-1].source, run(drive, LATE).left_out[-1].count) == ("imu", 5)
+    assert_equal_replay(drive, LATE)
+
+
 def test_blocks_of_rows(log: Log) -> None:
     """A second of each sensor at once, the IMU last: applied where they belong."""
     assert log.imu is not None

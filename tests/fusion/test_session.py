@@ -103,6 +103,7 @@ def assert_same(one: FusionResult, other: FusionResult) -> None:
             assert left.tobytes() == right.tobytes(), name
     assert one.aligned_ns == other.aligned_ns
     assert one.left_out == other.left_out
+    assert one.restarts == other.restarts
 
 
 @pytest.mark.parametrize("scene", SCENES)

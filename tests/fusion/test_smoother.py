@@ -2,27 +2,25 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-import fusion._kernels
-import fusion.motion
-import fusion.navigator
 import fusion.tape
-from fusion.config import FusionConfig
+from fusion.config import FusionConfig, HealthModel
+from fusion.layout import layout_of
 from fusion.result import States
 from fusion.run import Session, run
 from fusion.smoother import smooth, smoothed
-from fusion.state import Core
 from fusion.tape import Tape
 from sensors.records import Log
 from sensors.simulate import scenarios
 from sensors.simulate.drive import simulate, simulate_drive
 from sensors.simulate.trajectory import Truth
+from tests.fusion.dense_rts import Watch, rts
 from tests.fusion.free import HONEST_FREE
 from tests.fusion.scenes import later, only, seconds, with_gap, with_outage
 from tests.fusion.test_consistency import pose_and_velocity_nees
@@ -32,111 +30,6 @@ Floats = NDArray[np.float64]
 
 TOLERANCE = 1e-6
 """In smoothed sigmas: the oracle inverts covariances."""
-
-
-class Step(NamedTuple):
-    """One thing that happened to P: before and after; Phi of a transition, or dx of a correction, or t of a state."""
-
-    before: Floats
-    after: Floats
-    phi: Floats | None = None
-    dx: Floats | None = None
-    t_ns: int | None = None
-
-
-class Watch:
-    """Runs the kernel's loop as plain Python and writes down every step, without any tape."""
-
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.steps: list[Step] = []
-        self.kinds: set[str] = set()
-        kernels, motion = fusion._kernels, fusion.motion
-        for name in ("_handle", "_apply", "_coast", "motion"):
-            patch.setattr(kernels, name, getattr(kernels, name).py_func)
-        patch.setattr(motion, "_zero_rate", motion._zero_rate.py_func)
-        patch.setattr(fusion.navigator, "process", kernels.process.py_func)
-        real: dict[str, Callable[..., Any]] = {
-            name: getattr(kernels, name)
-            for name in ("_move", "propagate", "coast", "widen", "correct", "doubted", "record_state")
-        }
-
-        def move(core: Core, par: Any) -> None:
-            if core.span[0] != 0.0:
-                before = core.P.copy()
-                real["_move"](core, par)
-                phi = np.diag(core.stay)
-                phi[:9] = 0.0
-                phi[:9, : core.phi.shape[1]] = core.phi
-                self._add("move", Step(before, core.P.copy(), phi=phi))
-
-        def coast(P: Floats, seconds: float, accel: float, rate: float) -> None:
-            before, phi = P.copy(), np.eye(len(P))
-            phi[:3, 3:6] = seconds * np.eye(3)
-            real["coast"](P, seconds, accel, rate)
-            self._add("coast", Step(before, P.copy(), phi=phi))
-
-        def widen(P: Floats, *given: float) -> None:
-            before = P.copy()
-            real["widen"](P, *given)
-            self._add("widen", Step(before, P.copy(), phi=np.eye(len(P))))
-
-        def doubted(core: Core, *given: Any) -> None:
-            before = core.P.copy()
-            real["doubted"](core, *given)
-            if not np.array_equal(before, core.P):
-                self._add("give way", Step(before, core.P.copy(), phi=np.eye(len(before))))
-
-        def correct(nav: Floats, earth: Floats, P: Floats, W: Floats, dx: Floats, *given: Any) -> None:
-            before = P.copy()
-            real["correct"](nav, earth, P, W, dx, *given)
-            self._add("correct", Step(before, P.copy(), dx=dx.copy()))
-
-        def record_state(core: Core, rec: Any, t: int) -> None:
-            real["record_state"](core, rec, t)
-            self._add("state", Step(core.P.copy(), core.P.copy(), t_ns=t))
-
-        for name, function in (
-            *(("_move", move), ("coast", coast), ("widen", widen), ("doubted", doubted)),
-            *(("correct", correct), ("record_state", record_state)),
-        ):
-            patch.setattr(kernels, name, function)
-        patch.setattr(motion, "correct", correct)
-
-    def _add(self, kind: str, step: Step) -> None:
-        self.kinds.add(kind)
-        self.steps.append(step)
-
-
-def skew(v: Floats) -> Floats:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
-def reset_matrix(dx: Floats) -> Floats:
-    G = np.eye(len(dx))
-    G[6:9, 6:9] += 0.5 * skew(dx[6:9])
-    return G
-
-
-def rts(steps: list[Step]) -> dict[int, tuple[Floats, Floats]]:
-    """t -> smoothed error and covariance: Rauch, Tung and Striebel's recursion on dense matrices."""
-    found = {}
-    P = steps[-1].after
-    assert (np.diag(P) > 0).all()  # it is inverted
-    d = np.zeros(len(P))
-    for step in reversed(steps):
-        if step.phi is not None:
-            C = np.linalg.solve(step.after, step.phi @ step.before).T
-            d = C @ d
-            P = step.before + C @ (P - step.after) @ C.T
-        elif step.dx is not None:
-            back = np.linalg.inv(reset_matrix(step.dx))
-            d = back @ d + step.dx
-            P = back @ P @ back.T
-        else:
-            assert step.t_ns is not None
-            G = reset_matrix(d)
-            found[step.t_ns] = d, G @ P @ G.T
-    return found
 
 
 def rough(log: Log) -> Log:
@@ -152,22 +45,47 @@ def rough(log: Log) -> Log:
     return replace(log, gnss=replace(log.gnss, llh=llh), pose_fixes=replace(log.pose_fixes, pose=pose))
 
 
+SURE = FusionConfig(health=HealthModel(blown_sigma_m=1.0))
+"""A state that is not known to a metre counts as diverged, and alignment begins anew."""
+
+
 @pytest.fixture(scope="module")
 def log() -> Log:
     """Forty seconds with a standstill, all sensors."""
     return later(simulate(70.0, 2, scenarios.load("demo")), 30.0)
 
 
-@pytest.mark.parametrize("scene", ["whole", "rough"])
+def overturned(log: Log) -> Log:
+    """A gyro that is wrong by 20 deg/s for six seconds: outvoted, and outvoted again."""
+    assert log.imu is not None
+    s = seconds(log, log.imu.t_ns)
+    gyro = log.imu.gyro + np.where((s > 15.0) & (s < 21.0), np.radians(20.0), 0.0)[:, None] * [1.0, 0.0, 0.0]
+    return replace(log, imu=replace(log.imu, gyro=gyro))
+
+
+ALWAYS = {"move", "correct", "state", "fade"}
+SCENES: dict[str, tuple[Callable[[Log], Log], set[str]]] = {
+    "whole": (lambda log: log, set()),
+    "rough": (rough, {"coast", "widen", "give way", "renew"}),
+    "cut": (lambda log: with_outage(log, 12.0, 14.0), {"cut"}),
+    "starts again": (overturned, {"give way", "start again", "renew"}),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
 def test_equals_dense_rts(log: Log, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """State by state to rounding, in units of the smoothed sigma, over every kind of step."""
-    drive = rough(log) if scene == "rough" else log
-    result, states = smooth(drive)
+    """State by state to rounding, in units of the smoothed sigma, over every kind of step, with all blocks."""
+    change, more = SCENES[scene]
+    drive, config = change(log), SURE if scene == "cut" else FusionConfig()
+    layout = layout_of(drive.vehicle, config)
+    assert min(layout.gnss_error, layout.pose_error, layout.gyro_scale, layout.gyro_misalignment) >= 16
+    result, states = smooth(drive, config)
     with monkeypatch.context() as patch:
-        watch = Watch(patch)
-        run(drive)
+        watch = Watch(patch, layout)
+        run(drive, config)
     expected = rts(watch.steps)
-    assert watch.kinds == {"move", "correct", "state"} | ({"coast", "widen", "give way"} if scene == "rough" else set())
+    assert watch.kinds >= ALWAYS | more
+    assert len(result.restarts) == (scene == "cut")
     assert states.t_ns.tolist() == result.states.t_ns.tolist() == sorted(expected)
     moved = np.concatenate([displacement(result.states, states), states.vel_enu - result.states.vel_enu], axis=1)
     moved = np.concatenate([moved, turn(result.states, states), states.gyro_bias - result.states.gyro_bias], axis=1)
@@ -210,6 +128,24 @@ def test_the_tape_never_needs_more_than_was_set_aside(log: Log, portion: int, mo
     result, states = smooth(rough(log), FusionConfig(output_hz=100.0))
     assert len(states) == len(result.states) > 3000
     assert np.isfinite(states.sigma).all()
+
+
+def test_states_before_a_new_start_learn_nothing_from_after_it(log: Log) -> None:
+    """Whatever comes behind it moves them by no bit; the cut may lie anywhere in the portions."""
+    drive = with_outage(log, 12.0, 14.0)
+    result, states = smooth(drive, SURE)
+    (restart,) = result.restarts
+    before = states.t_ns <= restart.t_ns
+    assert 200 < before.sum() < len(states) - 100
+    assert drive.pose_fixes is not None
+    pose = drive.pose_fixes.pose + np.where(drive.pose_fixes.t_ns > restart.t_ns, 3.0, 0.0)[:, None] * [1.0, 1.0, 0.0]
+    other = replace(drive, gnss=None, gnss_velocity=None, pose_fixes=replace(drive.pose_fixes, pose=pose))
+    kept = {name: getattr(drive, name)[getattr(drive, name).t_ns <= restart.t_ns] for name in ("gnss", "gnss_velocity")}
+    moved, others = smooth(replace(other, **kept), SURE)
+    assert moved.restarts == result.restarts
+    assert others.llh[before].tobytes() == states.llh[before].tobytes()
+    assert others.sigma[before].tobytes() == states.sigma[before].tobytes()
+    assert np.abs(others.llh - states.llh)[~before].max() > 1e-7  # rad: metres
 
 
 def test_a_drive_that_never_aligns_has_no_smoothed_states(log: Log) -> None:
