@@ -111,7 +111,7 @@ def _apply_position(
             dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
             passed = _apply(core, rec, par, k, dof, threshold, accepted)
     if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
-        tally(core, which, passed, now)
+        tally(core, par, which, passed, now)
     if dof == 3:
         if passed:
             believed(core, which, now)

@@ -166,19 +166,39 @@ def test_a_streak_is_counted_and_ended() -> None:
     par, core = parameters(Vehicle(), FusionConfig()), core_at(3.5)
     for k in range(1, 12):
         assert threshold_of(core, par, 3, k * NS) == (par.reentry[2] if k > 10 else par.gate[2])
-        tally(core, 1, False, k * NS)
+        tally(core, par, 1, False, k * NS)
         assert core.doubt_clock[1, D_STREAK] == k
     now = 12 * NS
     assert threshold_of(core, par, 3, now + PAUSE_NS) == par.gate[2]
-    core.fresh[0] = 2.5  # seven sigmas from the streak
+    core.fresh[0] = 3.5 - 1.01 * ALIAS_M  # eleven sigmas from the streak, and another place on the road
     assert not goes_on(core, now)
     assert threshold_of(core, par, 3, now) == par.gate[2]
-    core.fresh[0] = 3.6
+    core.fresh[0] = 3.0  # four sigmas: noise has such tails
     assert threshold_of(core, par, 2, now) == par.reentry[1]
-    tally(core, 0, False, now)  # of GNSS nothing is counted
+    tally(core, par, 0, False, now)  # of GNSS nothing is counted
     assert core.doubt_clock[1, D_STREAK] == 11
-    tally(core, 1, True, now)
+    tally(core, par, 1, True, now)
     assert (core.doubt_clock[1, D_STREAK], core.doubt_clock[1, D_HELD]) == (0, now)
+
+
+def test_a_streak_outlasts_a_gross_frame_and_not_another_story() -> None:
+    par, core = parameters(Vehicle(), FusionConfig()), core_at(3.5)
+    for k in range(100):
+        tally(core, par, 1, False, k * NS)
+    assert core.doubt_clock[1, D_STREAK] == 2 * par.streak
+    for k in range(100, 105):  # half a second somewhere else
+        core.fresh[0] = -9.0
+        assert threshold_of(core, par, 3, k * NS) == par.gate[2]
+        tally(core, par, 1, False, k * NS)
+    core.fresh[0] = 3.5
+    assert threshold_of(core, par, 3, 105 * NS) == par.reentry[2]
+    core.fresh[0] = -9.0
+    for k in range(105, 120):  # and for good
+        tally(core, par, 1, False, k * NS)
+    assert core.doubt_clock[1, D_STREAK] == par.streak + 1
+    assert threshold_of(core, par, 3, 120 * NS) == par.reentry[2]  # nothing has held the state since it was tracking
+    core.fresh[0] = 3.5
+    assert threshold_of(core, par, 3, 120 * NS) == par.gate[2]
 
 
 @pytest.mark.parametrize(("east", "late"), [(3.5, TRACKING_NS + NS), (0.9 * ALIAS_M, 0)])
@@ -186,7 +206,7 @@ def test_what_is_no_alias_is_no_streak(east: float, late: int) -> None:
     """It began without a position to hold on to, or is too near for one."""
     par, core = parameters(Vehicle(), FusionConfig()), core_at(east)
     for k in range(30):
-        tally(core, 1, False, late + k * NS)
+        tally(core, par, 1, False, late + k * NS)
     assert core.doubt_clock[1, D_LAST] == late + 29 * NS
     assert threshold_of(core, par, 3, late + 30 * NS) == par.gate[2]
 
