@@ -8,7 +8,7 @@ hold on to: after an outage it is the state that has moved. A streak outlasts th
 is rejected as well: a gross error amid an alias makes the alias no truer.
 
 Maps repeat themselves every dash and every lane. Satellites do not: where GNSS jumps, from float to fixed, what comes
-after the jump is as likely to be right.
+after the jump is as likely to be right. But only where it stays: one reflection is no new error that lasts.
 """
 
 from fusion.events import Parameters
@@ -21,6 +21,8 @@ TRACKING_NS = 2_000_000_000
 """The filter was tracking if a position was applied within so long before the streak."""
 ALIAS_M = 1.5
 """Nothing that looks alike on a road lies nearer: half of a narrow lane, or of the shortest pitch of dashes."""
+INSISTING = 5
+"""So many GNSS positions rejected in a row before one may be explained by a new error that lasts."""
 SAME = 9.21
 """Largest squared distance, in variances, of a fix that goes on as the one before it: 99 % of two dimensions. The
 hundredth is none the less the same alias: so is what lies within ALIAS_M of it."""
@@ -34,6 +36,13 @@ def threshold_of(core: Core, par: Parameters, dof: int, now: int) -> float:
 
 
 @kernel()
+def may_renew(core: Core, which: int) -> bool:
+    """Whether a rejected position of sensor which (0 GNSS, 1 pose fix) may be judged with a new error that lasts."""
+    may: bool = which == 1 or core.doubt_clock[0, D_STREAK] >= INSISTING
+    return may
+
+
+@kernel()
 def goes_on(core: Core, now: int) -> bool:
     """Whether the pose fix core.fresh says what the streak says, and that may be an alias."""
     last, fresh = core.doubt[1], core.fresh
@@ -43,7 +52,8 @@ def goes_on(core: Core, now: int) -> bool:
     ee, en, nn = fresh[2] + last[10], fresh[3] + last[11], fresh[4] + last[12]
     apart: float = (nn * east * east - 2.0 * en * east * north + ee * north * north) / (ee * nn - en * en)
     same = apart <= SAME or east * east + north * north <= ALIAS_M**2
-    return same and fresh[0] ** 2 + fresh[1] ** 2 > ALIAS_M**2
+    alias: bool = same and fresh[0] ** 2 + fresh[1] ** 2 > ALIAS_M**2
+    return alias
 
 
 @kernel()
@@ -63,6 +73,7 @@ def tally(core: Core, par: Parameters, which: int, passed: bool, now: int) -> No
         clock[which, D_HELD] = now
         return
     if which == 0:
+        clock[0, D_STREAK] += 1
         return
     same = goes_on(core, now)
     if not _lasts(core, now):
