@@ -205,7 +205,7 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How well: this share of correct measurements has an innovation as small, -."""
     robust: Literal["none", "huber", "cauchy"] = "none"
     """Robust kernel on what passes the gate."""
-    robust_sigmas: Positive = 2.0
+    robust_sigmas: Positive = 1.0
     """Residual from which on it takes effect, root mean square over the components, standard deviations."""
 
 

@@ -4,10 +4,11 @@ While fixes are rejected P grows, and any jump would pass in the end: a steady a
 Growth of P explains how far the state has drifted since, not what was there when the streak began. So a fix that goes
 on as the rejected ones before it did must be explained well (``gates.reentry``), not just be possible. It is judged as
 ever where it differs from them (the alias has ended), after a pause, and where the streak began without a position to
-hold on to: after an outage it is the state that has moved.
+hold on to: after an outage it is the state that has moved. A streak outlasts the odd frame that says something else and
+is rejected as well: a gross error amid an alias makes the alias no truer.
 
 Maps repeat themselves every dash and every lane. Satellites do not: where GNSS jumps, from float to fixed, what comes
-after the jump is as likely to be right.
+after the jump is as likely to be right. But only where it stays: one reflection is no new error that lasts.
 """
 
 from fusion.events import Parameters
@@ -20,8 +21,11 @@ TRACKING_NS = 2_000_000_000
 """The filter was tracking if a position was applied within so long before the streak."""
 ALIAS_M = 1.5
 """Nothing that looks alike on a road lies nearer: half of a narrow lane, or of the shortest pitch of dashes."""
+INSISTING = 5
+"""So many GNSS positions rejected in a row before one may be explained by a new error that lasts."""
 SAME = 9.21
-"""Largest squared distance, in variances, of a fix that goes on as the one before it: 99 % of two dimensions."""
+"""Largest squared distance, in variances, of a fix that goes on as the one before it: 99 % of two dimensions. The
+hundredth is none the less the same alias: so is what lies within ALIAS_M of it."""
 
 
 @kernel()
@@ -32,19 +36,36 @@ def threshold_of(core: Core, par: Parameters, dof: int, now: int) -> float:
 
 
 @kernel()
+def may_renew(core: Core, which: int) -> bool:
+    """Whether a rejected position of sensor which (0 GNSS, 1 pose fix) may be judged with a new error that lasts."""
+    may: bool = which == 1 or core.doubt_clock[0, D_STREAK] >= INSISTING
+    return may
+
+
+@kernel()
 def goes_on(core: Core, now: int) -> bool:
-    """Whether the pose fix core.fresh says what the last rejected one said, and that may be an alias."""
-    clock, last, fresh = core.doubt_clock, core.doubt[1], core.fresh
-    if clock[1, D_STREAK] == 0 or now - clock[1, D_LAST] > PAUSE_NS:
+    """Whether the pose fix core.fresh says what the streak says, and that may be an alias."""
+    last, fresh = core.doubt[1], core.fresh
+    if not _lasts(core, now):
         return False
     east, north = fresh[0] - last[8], fresh[1] - last[9]
     ee, en, nn = fresh[2] + last[10], fresh[3] + last[11], fresh[4] + last[12]
     apart: float = (nn * east * east - 2.0 * en * east * north + ee * north * north) / (ee * nn - en * en)
-    return apart <= SAME and fresh[0] ** 2 + fresh[1] ** 2 > ALIAS_M**2
+    same = apart <= SAME or east * east + north * north <= ALIAS_M**2
+    alias: bool = same and fresh[0] ** 2 + fresh[1] ** 2 > ALIAS_M**2
+    return alias
 
 
 @kernel()
-def tally(core: Core, which: int, passed: bool, now: int) -> None:
+def _lasts(core: Core, now: int) -> bool:
+    """Whether there is a streak, and no pause since."""
+    clock = core.doubt_clock
+    lasts: bool = clock[1, D_STREAK] > 0 and now - clock[1, D_LAST] <= PAUSE_NS
+    return lasts
+
+
+@kernel()
+def tally(core: Core, par: Parameters, which: int, passed: bool, now: int) -> None:
     """Count a position of sensor which (0 GNSS, 1 the pose fix core.fresh), passed or rejected at time now."""
     clock = core.doubt_clock
     if passed:
@@ -52,11 +73,16 @@ def tally(core: Core, which: int, passed: bool, now: int) -> None:
         clock[which, D_HELD] = now
         return
     if which == 0:
+        clock[0, D_STREAK] += 1
         return
-    if not goes_on(core, now):
+    same = goes_on(core, now)
+    if not _lasts(core, now):
         clock[1, D_STREAK] = 0
         clock[1, D_TRACKING] = int(now - max(clock[0, D_HELD], clock[1, D_HELD]) <= TRACKING_NS)
-    clock[1, D_STREAK] += 1
+    elif not same:
+        clock[1, D_STREAK] = max(clock[1, D_STREAK] - 2, 0)
     clock[1, D_LAST] = now
-    for i in range(5):
-        core.doubt[1, 8 + i] = core.fresh[i]
+    if same or clock[1, D_STREAK] == 0:
+        clock[1, D_STREAK] = min(clock[1, D_STREAK] + 1, 2 * par.streak)
+        for i in range(5):
+            core.doubt[1, 8 + i] = core.fresh[i]

@@ -17,7 +17,7 @@ from fusion.recovery import believed, doubted, in_doubt
 from fusion.result import Reason, Sensor
 from fusion.robust import reweigh
 from fusion.state import A_T, H_CAUSE, H_STATE, ROW, Core
-from fusion.streak import tally, threshold_of
+from fusion.streak import may_renew, tally, threshold_of
 from fusion.tape import note_correction, note_move, note_state
 from sensors.kernel import kernel
 
@@ -103,7 +103,8 @@ def _apply_position(
     threshold = threshold_of(core, par, dof, now) if which else par.gate[dof - 1]
     passed = _apply(core, rec, par, k, dof, threshold, accepted)
     first = par.layout.pose_error if which else par.layout.gnss_error
-    if not passed and first >= 0:  # what lasted may have changed all at once: then the state need not move for it
+    # what lasted may have changed all at once: then the state need not move for it
+    if not passed and first >= 0 and may_renew(core, which):
         dof, accepted = measure(core, par, m, kind, ev.row[e], rate, False)
         known = innovate(core.P, core.H, core.W, dof, core.R, core.L)
         if known and whiten(dof, core.residual, core.L) <= threshold:
@@ -111,7 +112,7 @@ def _apply_position(
             dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
             passed = _apply(core, rec, par, k, dof, threshold, accepted)
     if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
-        tally(core, which, passed, now)
+        tally(core, par, which, passed, now)
     if dof == 3:
         if passed:
             believed(core, which, now)

@@ -31,21 +31,45 @@ WINDOWS = np.array([1.87, 0.935, 0.468])[:, None] * np.array([1.0, 1.0, np.radia
 SIGMA = np.array([0.05, 0.03, np.radians(0.13)])
 """Of a fix among landmarks, along, left and yaw, m, m, rad."""
 DASH_M, LANE_M = 6.0, 3.5
+STEP_M, STEP_DEG = 0.25, 0.25
+"""Of a lattice whose cells a matcher does not interpolate."""
 NOWHERE = (DURATION_S, DURATION_S)
 
 
 class Method(NamedTuple):
-    """A way of gating. every_level: it looks at the covariance of every level of the histogram, else at the finest."""
+    """A way of gating. careful: it looks at the covariance of every level of the histogram, else at the finest, and is
+    told the lattice of a matcher that has one."""
 
     config: FusionConfig
-    every_level: bool = True
+    careful: bool = True
 
 
 class Scene(NamedTuple):
-    """What goes wrong, in a line, and the log of a seed as a method gets it."""
+    """What goes wrong, in a line, and the log of a seed as a method gets it; lattice: the fixes lie on one."""
 
     story: str
     log: Callable[[int, Method], Log]
+    lattice: bool = False
+
+
+def informed(scene: Scene, method: Method) -> Method:
+    """The method with what it is told of the scene's matcher."""
+    if not (scene.lattice and method.careful):
+        return method
+    pose = msgspec.structs.replace(method.config.pose, step_m=STEP_M, step_deg=STEP_DEG)
+    return method._replace(config=msgspec.structs.replace(method.config, pose=pose))
+
+
+def coarse_lattice(seed: int, _: Method) -> Log:
+    """No GNSS for 170 s; fixes are the nodes of a lattice that lie nearest to what is seen, and claim a centimetre: of
+    peaks that sharp the histogram shows one cell."""
+    drive, _rng = _drive(seed)
+    log = _without_gnss(drive.log, (50.0, 220.0))
+    fixes = _fixes(log)
+    step = np.array([STEP_M, STEP_M, np.radians(STEP_DEG)])
+    claimed = np.tile(np.array([0.01, 0.01, np.radians(0.02)]), (len(fixes), 1))
+    nodes = replace(fixes, pose=np.round(fixes.pose / step) * step, cov=_turned(_axes(drive, fixes), claimed))
+    return replace(log, pose_fixes=nodes)
 
 
 def flat_road(seed: int, method: Method) -> Log:
@@ -61,7 +85,7 @@ def flat_road(seed: int, method: Method) -> Log:
     levels[blind, 2, 0, 0] = 0.15**2
     axes = _axes(drive, fixes)
     levels = axes[:, None] @ levels @ axes[:, None].transpose(0, 1, 3, 2)
-    cov = stated_covariance(levels, WINDOWS) if method.every_level else levels[:, -1]
+    cov = stated_covariance(levels, WINDOWS) if method.careful else levels[:, -1]
     return _fed_back(replace(log, pose_fixes=replace(fixes, cov=cov)), blind, rng.normal(0.0, 0.1, len(s)), method)
 
 
@@ -137,6 +161,9 @@ def canyon(seed: int, _: Method) -> Log:
 
 
 SCENES = {
+    "coarse lattice": Scene(
+        "170 s without GNSS; fixes are the nodes of a lattice of 0.25 m and deg, and claim 1 cm", coarse_lattice, True
+    ),
     "flat coarse levels": Scene(
         "90 s without landmarks along the road, GNSS, wheel: only coarse levels show it", flat_road
     ),

@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 from rich.table import Table
 
-from fusion.config import FusionConfig, Gates, PoseModel
-from replay.bench.gate_scenes import DURATION_S, SCENES, Method
+from fusion.config import FusionConfig, Gates, HealthModel, PoseModel
+from replay.bench.gate_scenes import DURATION_S, SCENES, Method, informed
 from replay.bench.measure import conditions, row
 from replay.config import RunConfig
 from replay.drive import Drive
@@ -19,10 +19,22 @@ from replay.scoring import Scorer
 from sensors.records import Log
 
 FIRST_SEED = 700_000
-BLINDFOLDED = PoseModel(max_sigma_longitudinal_m=1e6, max_sigma_lateral_m=1e6, max_sigma_yaw_deg=1e6, modes=False)
-"""No covariance gate."""
+BLINDFOLDED = PoseModel(
+    max_sigma_longitudinal_m=1e6,
+    max_sigma_lateral_m=1e6,
+    max_sigma_yaw_deg=1e6,
+    modes=False,
+    sigma_floor_m=0.0,
+    sigma_floor_yaw_deg=0.0,
+)
+"""The fix's covariance as it comes, and no gate on it."""
 ALONE = Gates(outvoted=10**9, streak=10**9)
 """Chi-square and nothing else."""
+
+
+def _naive(pose: PoseModel, gates: Gates, *, careful: bool) -> Method:
+    """A way that never starts again either."""
+    return Method(FusionConfig(pose=pose, gates=gates, health=HealthModel(restart=False)), careful)
 
 
 def _ours(**gates: Any) -> Method:
@@ -30,11 +42,9 @@ def _ours(**gates: Any) -> Method:
 
 
 METHODS = {
-    "accept everything": Method(
-        FusionConfig(pose=BLINDFOLDED, gates=msgspec.structs.replace(ALONE, use=False)), every_level=False
-    ),
-    "chi-square alone": Method(FusionConfig(pose=BLINDFOLDED, gates=ALONE), every_level=False),
-    "whole fix rejected": Method(FusionConfig(pose=PoseModel(partial=False), gates=ALONE)),
+    "accept everything": _naive(BLINDFOLDED, msgspec.structs.replace(ALONE, use=False), careful=False),
+    "chi-square alone": _naive(BLINDFOLDED, ALONE, careful=False),
+    "whole fix rejected": _naive(PoseModel(partial=False), ALONE, careful=True),
     "ours": _ours(),
     "ours, Huber": _ours(robust="huber"),
     "ours, Cauchy": _ours(robust="cauchy"),
@@ -45,12 +55,13 @@ def run(repeats: int = 5) -> dict[str, Any]:
     """Rows of AR and of the largest horizontal error along an axis, m, over `repeats` seeds of each scene."""
     rows = []
     seeds = range(FIRST_SEED, FIRST_SEED + repeats)
-    for scene, (_, make) in SCENES.items():
-        for name, method in METHODS.items():
-            found = [scored(make(seed, method), method.config) for seed in seeds]
+    for name_of_scene, scene in SCENES.items():
+        for name, plain in METHODS.items():
+            method = informed(scene, plain)
+            found = [scored(scene.log(seed, method), method.config) for seed in seeds]
             for metric, values in zip(("ar", "peak_m"), zip(*found, strict=True), strict=True):
-                rows.append(row(f"{scene}: {name}", metric, values))
-    stories = {scene: story for scene, (story, _) in SCENES.items()}
+                rows.append(row(f"{name_of_scene}: {name}", metric, values))
+    stories = {name: scene.story for name, scene in SCENES.items()}
     facts = {"seeds": list(seeds), "duration_s": DURATION_S, "scenes": stories}
     return {"bench": "gates", "rows": rows, "ratios": {}, "conditions": conditions(["numba", "numpy"], **facts)}
 

@@ -94,8 +94,8 @@ def stated(cov: Floats, pose: PoseModel) -> Floats:
 
 
 def test_quantization_of_the_lattice_is_added_before_inflation() -> None:
-    plain = stated(SHARP, PoseModel())
-    stepped = stated(SHARP, PoseModel(step_m=0.125, step_deg=0.125))
+    plain = stated(SHARP, PoseModel(inflation=4.0))
+    stepped = stated(SHARP, PoseModel(inflation=4.0, step_m=0.125, step_deg=0.125))
     expected = 4.0 * np.array([0.125, 0.125, np.radians(0.125)]) ** 2 / 12.0
     assert np.diag(stepped - plain) == pytest.approx(expected, rel=1e-9)
 

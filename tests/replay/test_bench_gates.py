@@ -103,13 +103,13 @@ def test_the_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
     monkeypatch.setattr(gates, "SCENES", {name: SCENES[name] for name in ("gross frames", "wrong RTK fix")})
     monkeypatch.setattr(gates, "METHODS", {name: METHODS[name] for name in ("accept everything", "ours")})
     monkeypatch.setattr(gates, "FIRST_SEED", SEED)
-    assert main(["bench", "gates", "--repeats", "1", "--json"]) == 0
+    assert main(["bench", "gates", "--drives", "1", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["bench"], result["ratios"], result["conditions"]["seeds"]) == ("gates", {}, [SEED])
     assert [entry["metric"] for entry in result["rows"]] == ["ar", "peak_m"] * 4
     row = next(entry for entry in result["rows"] if entry["name"] == "wrong RTK fix: accept everything")
     assert row["min"] == row["median"] == row["max"] < 0.95
-    assert main(["bench", "gates", "--repeats", "1"]) == 0
+    assert main(["bench", "gates", "--drives", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     line = next(text for text in lines if "wrong RTK fix" in text)
     assert line.split() == [
