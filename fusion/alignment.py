@@ -113,7 +113,7 @@ class Aligner:
         if place.sensor == Sensor.POSE_FIX:
             inherit_pose(P, self._poses[-1], nav, self._par, yaw_too=sensor == Sensor.POSE_FIX)
         else:
-            inherit_gnss(P, self._positions[-1], nav, self._par)
+            inherit_gnss(P, self._positions[-1], nav, window.rate, acceleration[0], self._par)
         return Initial(t_ns, nav, P, Sensor(sensor))
 
     def _take(self, t_ns: int, sensor: int, row: int, m: Measurements) -> None:

@@ -96,10 +96,14 @@ def see_arm(H: Floats, layout: Layout, r: Matrix, rate: Vector, of_velocity: boo
 
 
 @kernel()
-def see_delay(nav: Floats, H: Floats, residual: Floats, k: int, change: Vector) -> None:
-    """A measurement that is older than thought by the delay state k: it shows change (3,), per second, less of it."""
+def see_delay(nav: Floats, H: Floats, residual: Floats, k: int, change: Vector, bend: Vector) -> None:
+    """A measurement that is older than thought by the delay state k: it shows change (3,), per second, less of it.
+
+    bend: the change of that, per second; a car that brakes nods, so without it a delay passes for a higher antenna.
+    """
     if k < 0:
         return
+    delay = nav[k + 1]
     for i in range(3):
-        H[i, k] = -change[i]
-        residual[i] += change[i] * nav[k + 1]
+        H[i, k] = bend[i] * delay - change[i]
+        residual[i] += (change[i] - 0.5 * bend[i] * delay) * delay

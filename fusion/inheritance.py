@@ -15,12 +15,13 @@ from fusion.state import E_POSITION, QUATERNION, VELOCITY, Floats
 from sensors.rotation import matrix_from_q
 
 
-def inherit_gnss(P: Floats, fix: Fix, nav: Floats, par: Parameters) -> None:
+def inherit_gnss(P: Floats, fix: Fix, nav: Floats, rate: Floats, acceleration: Floats, par: Parameters) -> None:
     """Of a GNSS position: P (n, n) gets its whole covariance and the correlation with the states of what lasts, of the
-    lever arm and of the delay. nav (17,): the first state."""
+    lever arm and of the delay. nav (17,): the first state; rate (3,): body, rad/s; acceleration (3,): ENU, m/s^2."""
     first, (white, lasts) = par.layout.gnss_error, par.gnss_shares
-    _carry(P, E_POSITION, par.layout.gnss_arm, -matrix_from_q(nav[QUATERNION]))
-    _carry(P, E_POSITION, par.layout.gnss_delay, nav[VELOCITY][:, None])
+    R = matrix_from_q(nav[QUATERNION])
+    _carry(P, slice(0, 6), par.layout.gnss_arm, -np.vstack((R, R @ np.cross(rate, np.eye(3)).T)))
+    _carry(P, slice(0, 6), par.layout.gnss_delay, np.concatenate((nav[VELOCITY], acceleration))[:, None])
     if first < 0:
         return
     P[E_POSITION, E_POSITION] += (white + lasts - 1.0) * fix.cov
@@ -34,6 +35,7 @@ def inherit_pose(P: Floats, fix: Fix, nav: Floats, par: Parameters, *, yaw_too: 
     layout, (white, lasts) = par.layout, par.pose_shares
     yaw_too = yaw_too and fix.cov[2, 2] <= par.pose_limits[2] ** 2
     taken = np.array([0, 1, 8] if yaw_too else [0, 1])
+    _carry(P, slice(2, 3), layout.gnss_arm, -matrix_from_q(nav[QUATERNION])[2:])  # the height is that of the antenna
     _carry(P, slice(0, 2), layout.pose_delay, nav[VELOCITY][:2, None])
     if yaw_too:
         _carry(P, slice(8, 9), layout.pose_yaw, -np.eye(1))

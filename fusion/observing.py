@@ -2,7 +2,7 @@
 
 import math
 
-from fusion._linalg import Matrix, Vector, attitude, matvec
+from fusion._linalg import Matrix, Vector, attitude, cross, matvec
 from fusion.blocks import arm_of, fade, lasting, renew, scale, see_arm, see_delay
 from fusion.events import Measurements, Parameters
 from fusion.measurements import Pair, gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
@@ -65,12 +65,13 @@ def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rat
     nav, H, layout = core.nav, core.H, par.layout
     see_arm(H, layout, r, rate, of_velocity)
     if layout.gnss_delay >= 0:
-        change: Vector = (nav[3], nav[4], nav[5])
+        push = acceleration(core, r)
         if of_velocity:
-            f: Vector = (core.last[0, 3] - nav[13], core.last[0, 4] - nav[14], core.last[0, 5] - nav[15])
-            change = matvec(r, f)
-            change = (change[0], change[1], change[2] - NORMAL_GRAVITY)
-        see_delay(nav, H, core.residual, layout.gnss_delay, change)
+            see_delay(nav, H, core.residual, layout.gnss_delay, push, (0.0, 0.0, 0.0))
+        else:
+            swing = matvec(r, cross(rate, arm_of(nav, layout, par.gnss_arm)))
+            change: Vector = (nav[3] + swing[0], nav[4] + swing[1], nav[5] + swing[2])
+            see_delay(nav, H, core.residual, layout.gnss_delay, change, push)
     if layout.gnss_error < 0 or of_velocity:
         return
     if lasts:
@@ -107,7 +108,7 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
     R[1, 2] = R[2, 1] = c * ny - s * ey
     R[2, 2] = cov[row, 2, 2]
     a, b, turn = triple(m.pose_spread, row)
-    _see_matching(core, par, (c, s), r[8] * rate[2], lasts)
+    _see_matching(core, par, (c, s), rate, lasts)
     grown = 1.0
     if par.layout.pose_error >= 0:  # R has been scaled
         grown = math.sqrt(par.pose_shares[0] + (0.0 if lasts else par.pose_shares[1]))
@@ -118,13 +119,17 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
 
 
 @kernel(inline="always")
-def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float, lasts: bool) -> None:
+def _see_matching(core: Core, par: Parameters, ahead: Pair, rate: Vector, lasts: bool) -> None:
     """What the blocks add to a pose fix (along, left, yaw)."""
     nav, H, residual, layout = core.nav, core.H, core.residual, par.layout
     c, s = ahead
     if layout.pose_delay >= 0:
-        change: Vector = (c * nav[3] + s * nav[4], c * nav[4] - s * nav[3], yaw_rate)
-        see_delay(nav, H, residual, layout.pose_delay, change)
+        r = attitude(nav)
+        swing, push = matvec(r, cross(rate, par.pose_arm)), acceleration(core, r)
+        east, north = nav[3] + swing[0], nav[4] + swing[1]
+        change: Vector = (c * east + s * north, c * north - s * east, r[8] * rate[2])
+        bend: Vector = (c * push[0] + s * push[1], c * push[1] - s * push[0], 0.0)
+        see_delay(nav, H, residual, layout.pose_delay, change, bend)
     if layout.pose_yaw >= 0:
         H[2, layout.pose_yaw] = 1.0
         residual[2] -= nav[layout.pose_yaw + 1]
@@ -135,6 +140,15 @@ def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float, las
         core.aged[1] = 0.0
         lasting(nav, H, core.R, residual, core.L, layout.pose_error, par.pose_shares[1])
     scale(core.R, par.pose_shares[0] + (0.0 if lasts else par.pose_shares[1]))
+
+
+@kernel()
+def acceleration(core: Core, r: Matrix) -> Vector:
+    """By the last sample, ENU m/s^2."""
+    nav = core.nav
+    f: Vector = (core.last[0, 3] - nav[13], core.last[0, 4] - nav[14], core.last[0, 5] - nav[15])
+    a = matvec(r, f)
+    return a[0], a[1], a[2] - NORMAL_GRAVITY
 
 
 @kernel()

@@ -182,7 +182,8 @@ class Estimated:
 @dataclass(frozen=True, slots=True, eq=False)
 class FusionResult:
     """States, decisions, the time of the first state (None: never aligned, states are empty), what was left out, when
-    the filter was started again, and at the end of a drive what it found of the calibration (``fusion.calibration``)."""
+    the filter was started again, and at the end of a drive what it shows of the calibration (``fusion.calibration``).
+    """
 
     states: States
     decisions: Decisions
