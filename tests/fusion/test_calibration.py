@@ -45,7 +45,7 @@ def spoiled(seed: int, seconds: float) -> Log:
     log = simulate(seconds, seed, load("clean"))
     assert log.imu is not None
     assert log.wheel is not None
-    arm = np.array(log.vehicle.gnss_lever_arm) + (0.3, -0.3, 0.3)
+    arm = np.add(log.vehicle.gnss_lever_arm, (0.3, -0.3, 0.3))
     return replace(
         log,
         imu=replace(log.imu, gyro=log.imu.gyro * (1.0, 1.0, 1.003)),
