@@ -3,13 +3,13 @@
 import math
 
 from fusion._linalg import Matrix, Vector, attitude, cross, matvec
-from fusion.blocks import arm_of, fade, lasting, renew, scale, see_arm, see_delay
+from fusion.blocks import allow_delay, arm_of, fade, lasting, renew, scale, see_arm, see_delay
 from fusion.events import Measurements, Parameters
 from fusion.measurements import Pair, gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.modes import observe
 from fusion.motion import clear
 from fusion.result import Reason, Sensor
-from fusion.state import ROW, Core, Floats
+from fusion.state import C_COUNT, C_SAMPLE, RING_SIZE, ROW, Core, Floats
 from sensors.kernel import kernel
 
 _GNSS_POSITION = int(Sensor.GNSS_POSITION)
@@ -19,6 +19,8 @@ _POSE_FIX = int(Sensor.POSE_FIX)
 _ACCEPTED = int(Reason.ACCEPTED)
 NORMAL_GRAVITY = 9.81
 """Near enough for the acceleration over a delay, m/s^2."""
+SMOOTHED_NS = 200_000_000
+"""Over so long it is averaged."""
 
 
 @kernel(inline="always")
@@ -63,11 +65,11 @@ def measure(
 def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rate: Vector, lasts: bool) -> None:
     """What the blocks add to an antenna's position or velocity."""
     nav, H, layout = core.nav, core.H, par.layout
-    see_arm(H, layout, r, rate, of_velocity)
+    see_arm(H, layout, r, rate, of_velocity, par.level)
     if layout.gnss_delay >= 0:
         push = acceleration(core, r)
         if of_velocity:
-            see_delay(nav, H, core.residual, layout.gnss_delay, push, (0.0, 0.0, 0.0))
+            allow_delay(core, layout.gnss_delay, push)
         else:
             swing = matvec(r, cross(rate, arm_of(nav, layout, par.gnss_arm)))
             change: Vector = (nav[3] + swing[0], nav[4] + swing[1], nav[5] + swing[2])
@@ -144,9 +146,21 @@ def _see_matching(core: Core, par: Parameters, ahead: Pair, rate: Vector, lasts:
 
 @kernel()
 def acceleration(core: Core, r: Matrix) -> Vector:
-    """By the last sample, ENU m/s^2."""
-    nav = core.nav
-    f: Vector = (core.last[0, 3] - nav[13], core.last[0, 4] - nav[14], core.last[0, 5] - nav[15])
+    """Mean over the last samples, ENU m/s^2: one alone says more of the engine."""
+    nav, count = core.nav, core.clock[C_COUNT]
+    newest = core.clock[C_SAMPLE]
+    x, y, z, n = 0.0, 0.0, 0.0, 0
+    for back in range(min(count, RING_SIZE)):
+        i = (count - 1 - back) & (len(core.ring_t) - 1)
+        if core.ring_t[i] < newest - SMOOTHED_NS:
+            break
+        x += core.ring[i, 3]
+        y += core.ring[i, 4]
+        z += core.ring[i, 5]
+        n += 1
+    if n == 0:
+        return 0.0, 0.0, 0.0
+    f: Vector = (x / n - nav[13], y / n - nav[14], z / n - nav[15])
     a = matvec(r, f)
     return a[0], a[1], a[2] - NORMAL_GRAVITY
 
