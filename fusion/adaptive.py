@@ -154,11 +154,13 @@ def split_of(values: Mapping[str, float]) -> dict[str, float]:
 
 
 def open_to_all(config: FusionConfig) -> FusionConfig:
-    """Without gates and floors: what counts must not depend on the noise that is tried. An uncertain lever arm is
-    estimated: taken as white noise of every fix it would hide theirs."""
+    """Without gates and floors: what counts must not depend on the noise that is tried. A lever arm that the vehicle
+    calls uncertain is estimated: taken as white noise of every fix it would hide theirs."""
     wide = {"pose.max_sigma_longitudinal_m": 1e3, "pose.max_sigma_lateral_m": 1e3, "pose.max_sigma_yaw_deg": 1e3}
     floors = {"gnss.sigma_floor_horizontal_m", "gnss.sigma_floor_vertical_m", "gnss.sigma_floor_velocity"}
     floors |= {"pose.sigma_floor_m", "pose.sigma_floor_yaw_deg"}
+    if not config.estimate.lever_arm:
+        floors.add("estimate.lever_arm_sigma_m")
     opened = with_values(config, wide | dict.fromkeys(sorted(floors), 0.0) | {"estimate.lever_arm": True})
     return msgspec.structs.replace(opened, gates=Gates(use=False), output_hz=1.0)
 

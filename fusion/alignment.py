@@ -111,9 +111,9 @@ class Aligner:
         acceleration = (np.zeros(3), 0.0) if still else self._acceleration(t_ns, window)
         nav, P = self._state(yaw, velocity, place, window, acceleration)
         if place.sensor == Sensor.POSE_FIX:
-            inherit_pose(P, self._poses[-1], self._par, yaw_too=sensor == Sensor.POSE_FIX)
+            inherit_pose(P, self._poses[-1], nav, self._par, yaw_too=sensor == Sensor.POSE_FIX)
         else:
-            inherit_gnss(P, self._positions[-1], self._par)
+            inherit_gnss(P, self._positions[-1], nav, window.rate, acceleration[0], self._par)
         return Initial(t_ns, nav, P, Sensor(sensor))
 
     def _take(self, t_ns: int, sensor: int, row: int, m: Measurements) -> None:

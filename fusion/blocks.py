@@ -81,8 +81,12 @@ def arm_of(nav: Floats, layout: Layout, arm: Vector) -> Vector:
 
 
 @kernel()
-def see_arm(H: Floats, layout: Layout, r: Matrix, rate: Vector, of_velocity: bool) -> None:
-    """Jacobian of an antenna's position, R, or velocity, R [omega]x, against the lever arm."""
+def see_arm(H: Floats, layout: Layout, r: Matrix, rate: Vector, of_velocity: bool, level: bool) -> None:
+    """Jacobian of an antenna's position, R, or velocity, R [omega]x, against the lever arm.
+
+    level: a land vehicle hardly tilts, less than its estimated tilt settles: seen through that, the antenna's height
+    would seem to show in the plane.
+    """
     k = layout.gnss_arm
     if k < 0:
         return
@@ -90,16 +94,31 @@ def see_arm(H: Floats, layout: Layout, r: Matrix, rate: Vector, of_velocity: boo
         unit: Vector = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
         if of_velocity:
             unit = cross(rate, unit)
-        column = matvec(r, unit)
+        column = unit if level and j == 2 and not of_velocity else matvec(r, unit)
         for i in range(3):
             H[i, k + j] = column[i]
 
 
 @kernel()
-def see_delay(nav: Floats, H: Floats, residual: Floats, k: int, change: Vector) -> None:
-    """A measurement that is older than thought by the delay state k: it shows change (3,), per second, less of it."""
-    if k < 0:
-        return
+def see_delay(nav: Floats, H: Floats, residual: Floats, k: int, change: Vector, bend: Vector) -> None:
+    """A measurement that is older than thought by the delay state k: it shows change (3,), per second, less of it.
+
+    bend: the change of that, per second; a car that brakes nods, so without it a delay passes for a higher antenna.
+    """
+    delay = nav[k + 1]
     for i in range(3):
-        H[i, k] = -change[i]
-        residual[i] += change[i] * nav[k + 1]
+        H[i, k] = bend[i] * delay - change[i]
+        residual[i] += (change[i] - 0.5 * bend[i] * delay) * delay
+
+
+@kernel()
+def allow_delay(core: Core, k: int, change: Vector) -> None:
+    """The same where the change is known badly: it corrects the residual and widens R, and shows nothing of the delay.
+
+    An acceleration is shaken by engine and road. What is regressed on noise comes out too small, and sure of itself.
+    """
+    nav, R, variance = core.nav, core.R, core.P[k, k]
+    for i in range(3):
+        core.residual[i] += change[i] * nav[k + 1]
+        for j in range(3):
+            R[i, j] += change[i] * change[j] * variance

@@ -173,10 +173,18 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is estimated along with the state, each from its value in [vehicle] on."""
+    """What is estimated along with the state, each from its value in [vehicle] on (``fusion.calibration``)."""
 
     lever_arm: bool = False
     """The GNSS lever arm; its sigma is the vehicle's gnss_lever_arm_sigma_m."""
+    lever_arm_sigma_m: NonNegative = 0.5
+    """Sigma of each axis where the vehicle's is 0; 0: the arm is known then, m."""
+    gyro: bool = False
+    """Scale and misalignment of the gyro about the vertical axis, where the vehicle's IMU has no sigmas for them."""
+    gyro_scale_sigma_ppm: NonNegative = 3000.0
+    """Sigma of that scale error before anything is known of it, ppm."""
+    gyro_misalignment_sigma_deg: NonNegative = 0.2
+    """The same of the misalignment, deg."""
     mounting: bool = False
     """Pitch and yaw of the vehicle's axes against the body's, which the non-holonomic constraint needs."""
     mounting_sigma_deg: Positive = 1.0

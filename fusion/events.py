@@ -74,6 +74,8 @@ class Parameters(NamedTuple):
     zero_velocity_var: float
     zero_rate_var: float
     health: HealthLimits
+    level: bool
+    """A land vehicle, which hardly tilts."""
 
 
 class Measurements(NamedTuple):

@@ -7,10 +7,11 @@ applied.
 
 from typing import NamedTuple
 
+from fusion.calibration import estimates
 from fusion.config import FusionConfig
 from fusion.covariance import propagate
 from fusion.navigator import Navigator
-from fusion.result import Decisions, Restart, States
+from fusion.result import Decisions, Estimated, Restart, States
 from fusion.rewinding import RewindingNavigator
 from fusion.state import ACCEL_BIAS, C_STATE, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core, Floats
 from fusion.timeline import parameters
@@ -52,6 +53,7 @@ class Localizer:
         self, vehicle: Vehicle | None = None, map_frame: MapFrame | None = None, config: FusionConfig | None = None
     ) -> None:
         vehicle, config = vehicle or Vehicle(), config or FusionConfig()
+        self._vehicle, self._config = vehicle, config
         self._noise = parameters(vehicle, config).noise
         self._navigator: Navigator
         if config.order == "arrival":
@@ -96,6 +98,10 @@ class Localizer:
     def take_restarts(self) -> tuple[Restart, ...]:
         """Divergences since the last call after which alignment began anew."""
         return self._navigator.take_restarts()
+
+    def estimates(self) -> tuple[Estimated, ...]:
+        """What the drive has shown of the calibration by now (``fusion.calibration``)."""
+        return estimates(self.core, self._vehicle, self._config)
 
     def take_states(self) -> States:
         """States recorded since the last call."""

@@ -2,14 +2,14 @@
 
 import math
 
-from fusion._linalg import Matrix, Vector, attitude, matvec
-from fusion.blocks import arm_of, fade, lasting, renew, scale, see_arm, see_delay
+from fusion._linalg import Matrix, Vector, attitude, cross, matvec
+from fusion.blocks import allow_delay, arm_of, fade, lasting, renew, scale, see_arm, see_delay
 from fusion.events import Measurements, Parameters
 from fusion.measurements import Pair, gnss_position, gnss_velocity, heading, pose_fix, wheel_speed, wrap, yaw_row
 from fusion.modes import observe
 from fusion.motion import clear
 from fusion.result import Reason, Sensor
-from fusion.state import ROW, Core, Floats
+from fusion.state import C_COUNT, C_SAMPLE, RING_SIZE, ROW, Core, Floats
 from sensors.kernel import kernel
 
 _GNSS_POSITION = int(Sensor.GNSS_POSITION)
@@ -19,6 +19,8 @@ _POSE_FIX = int(Sensor.POSE_FIX)
 _ACCEPTED = int(Reason.ACCEPTED)
 NORMAL_GRAVITY = 9.81
 """Near enough for the acceleration over a delay, m/s^2."""
+SMOOTHED_NS = 200_000_000
+"""Over so long it is averaged."""
 
 
 @kernel(inline="always")
@@ -63,14 +65,15 @@ def measure(
 def _see_receiver(core: Core, par: Parameters, r: Matrix, of_velocity: bool, rate: Vector, lasts: bool) -> None:
     """What the blocks add to an antenna's position or velocity."""
     nav, H, layout = core.nav, core.H, par.layout
-    see_arm(H, layout, r, rate, of_velocity)
+    see_arm(H, layout, r, rate, of_velocity, par.level)
     if layout.gnss_delay >= 0:
-        change: Vector = (nav[3], nav[4], nav[5])
+        push = acceleration(core, r)
         if of_velocity:
-            f: Vector = (core.last[0, 3] - nav[13], core.last[0, 4] - nav[14], core.last[0, 5] - nav[15])
-            change = matvec(r, f)
-            change = (change[0], change[1], change[2] - NORMAL_GRAVITY)
-        see_delay(nav, H, core.residual, layout.gnss_delay, change)
+            allow_delay(core, layout.gnss_delay, push)
+        else:
+            swing = matvec(r, cross(rate, arm_of(nav, layout, par.gnss_arm)))
+            change: Vector = (nav[3] + swing[0], nav[4] + swing[1], nav[5] + swing[2])
+            see_delay(nav, H, core.residual, layout.gnss_delay, change, push)
     if layout.gnss_error < 0 or of_velocity:
         return
     if lasts:
@@ -107,7 +110,7 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
     R[1, 2] = R[2, 1] = c * ny - s * ey
     R[2, 2] = cov[row, 2, 2]
     a, b, turn = triple(m.pose_spread, row)
-    _see_matching(core, par, (c, s), r[8] * rate[2], lasts)
+    _see_matching(core, par, (c, s), rate, lasts)
     grown = 1.0
     if par.layout.pose_error >= 0:  # R has been scaled
         grown = math.sqrt(par.pose_shares[0] + (0.0 if lasts else par.pose_shares[1]))
@@ -118,13 +121,17 @@ def _measure_pose(core: Core, par: Parameters, m: Measurements, row: int, rate: 
 
 
 @kernel(inline="always")
-def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float, lasts: bool) -> None:
+def _see_matching(core: Core, par: Parameters, ahead: Pair, rate: Vector, lasts: bool) -> None:
     """What the blocks add to a pose fix (along, left, yaw)."""
     nav, H, residual, layout = core.nav, core.H, core.residual, par.layout
     c, s = ahead
     if layout.pose_delay >= 0:
-        change: Vector = (c * nav[3] + s * nav[4], c * nav[4] - s * nav[3], yaw_rate)
-        see_delay(nav, H, residual, layout.pose_delay, change)
+        r = attitude(nav)
+        swing, push = matvec(r, cross(rate, par.pose_arm)), acceleration(core, r)
+        east, north = nav[3] + swing[0], nav[4] + swing[1]
+        change: Vector = (c * east + s * north, c * north - s * east, r[8] * rate[2])
+        bend: Vector = (c * push[0] + s * push[1], c * push[1] - s * push[0], 0.0)
+        see_delay(nav, H, residual, layout.pose_delay, change, bend)
     if layout.pose_yaw >= 0:
         H[2, layout.pose_yaw] = 1.0
         residual[2] -= nav[layout.pose_yaw + 1]
@@ -135,6 +142,27 @@ def _see_matching(core: Core, par: Parameters, ahead: Pair, yaw_rate: float, las
         core.aged[1] = 0.0
         lasting(nav, H, core.R, residual, core.L, layout.pose_error, par.pose_shares[1])
     scale(core.R, par.pose_shares[0] + (0.0 if lasts else par.pose_shares[1]))
+
+
+@kernel()
+def acceleration(core: Core, r: Matrix) -> Vector:
+    """Mean over the last samples, ENU m/s^2: one alone says more of the engine."""
+    nav, count = core.nav, core.clock[C_COUNT]
+    newest = core.clock[C_SAMPLE]
+    x, y, z, n = 0.0, 0.0, 0.0, 0
+    for back in range(min(count, RING_SIZE)):
+        i = (count - 1 - back) & (len(core.ring_t) - 1)
+        if core.ring_t[i] < newest - SMOOTHED_NS:
+            break
+        x += core.ring[i, 3]
+        y += core.ring[i, 4]
+        z += core.ring[i, 5]
+        n += 1
+    if n == 0:
+        return 0.0, 0.0, 0.0
+    f: Vector = (x / n - nav[13], y / n - nav[14], z / n - nav[15])
+    a = matvec(r, f)
+    return a[0], a[1], a[2] - NORMAL_GRAVITY
 
 
 @kernel()

@@ -165,13 +165,29 @@ class Restart(NamedTuple):
     cause: int
 
 
+@dataclass(frozen=True, slots=True)
+class Estimated:
+    """A constant as the filter ends up with it: value, of which given comes from the vehicle, sigma, and the sigma that
+    it began with, all in unit; excited: whether the drive shows it (else it keeps its prior)."""
+
+    name: str
+    unit: str
+    given: float
+    value: float
+    sigma: float
+    prior_sigma: float
+    excited: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FusionResult:
-    """States, decisions, the time of the first state (None: never aligned, states are empty), what was left out, and
-    when the filter was started again."""
+    """States, decisions, the time of the first state (None: never aligned, states are empty), what was left out, when
+    the filter was started again, and at the end of a drive what it shows of the calibration (``fusion.calibration``).
+    """
 
     states: States
     decisions: Decisions
     aligned_ns: int | None
     left_out: Sequence[LeftOut] = ()
     restarts: Sequence[Restart] = ()
+    estimates: tuple[Estimated, ...] = ()

@@ -1,7 +1,10 @@
 """Fusing a drive: a Session takes it in pieces, ``run`` in one."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from fusion.calibration import estimates
 from fusion.config import FusionConfig
 from fusion.navigator import FOREVER, Navigator
 from fusion.recording import join
@@ -36,7 +39,7 @@ class Session:
         tape: Tape | None = None,
     ) -> None:
         """tape: takes down what ``fusion.smoother`` needs."""
-        self._config = config or FusionConfig()
+        self._vehicle, self._config = vehicle, config or FusionConfig()
         if self._config.order == "arrival":
             if tape is not None:
                 raise EgolocError('fusion.order: expected "stamp" to smooth a drive, got "arrival"')
@@ -68,7 +71,8 @@ class Session:
         self._navigator.advance(FOREVER)
         aligned = self._navigator.core is not None
         self._navigator.decide(Reason.OUTSIDE_IMU if aligned else Reason.BEFORE_ALIGNMENT)
-        return self._result(())
+        found = estimates(self._navigator.core, self._vehicle, self._config)
+        return replace(self._result(()), estimates=found)
 
     def _result(self, left_out: tuple[LeftOut, ...]) -> FusionResult:
         navigator = self._navigator
@@ -104,6 +108,7 @@ def joined(results: list[FusionResult]) -> FusionResult:
         results[-1].aligned_ns,
         summed(entry for result in results for entry in result.left_out),
         tuple(restart for result in results for restart in result.restarts),
+        results[-1].estimates,
     )
 
 

@@ -99,6 +99,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         zero_velocity_var=motion.zero_velocity_sigma**2,
         zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2) + noise.gyro_psd * motion.rate_hz,
         health=_health_limits(config, land_vehicle=vehicle.land_vehicle),
+        level=vehicle.land_vehicle,
     )
 
 

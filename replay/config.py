@@ -28,6 +28,15 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Yaw, deg."""
 
 
+ESTIMATED = {
+    "lever-arm": ("lever_arm",),
+    "mounting": ("mounting",),
+    "gyro": ("gyro",),
+    "delays": ("gnss_delay", "pose_delay"),
+    "gnss-delay": ("gnss_delay",),
+    "pose-delay": ("pose_delay",),
+}
+"""What --estimate takes, and the switches of [fusion.estimate] that it stands for."""
 SHORTEST_STRETCH_S = 0.1
 """Of hidden GNSS."""
 LIMITS = {
@@ -119,6 +128,17 @@ def with_faults(config: RunConfig, specs: Sequence[str], where: str = "--inject"
                 f"{where}: {one.fault.name}: expected no fault of GNSS with --hide-gnss: it is the reference"
             )
     return msgspec.structs.replace(config, inject=tuple(one.spec for one in injections))
+
+
+def with_estimates(config: RunConfig, names: str) -> RunConfig:
+    """The config with these of ESTIMATED, separated by commas, estimated along; others stay as they are."""
+    chosen: dict[str, bool] = {}
+    for name in names.split(","):
+        if name not in ESTIMATED:
+            raise EgolocError(f"--estimate: expected any of {', '.join(ESTIMATED)}, got {name!r}")
+        chosen |= dict.fromkeys(ESTIMATED[name], True)
+    estimate = msgspec.structs.replace(config.fusion.estimate, **chosen)
+    return msgspec.structs.replace(config, fusion=msgspec.structs.replace(config.fusion, estimate=estimate))
 
 
 def to_toml(config: msgspec.Struct) -> str:

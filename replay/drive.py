@@ -9,8 +9,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fusion.result import FusionResult, States
+from fusion.result import Estimated, FusionResult, States
 from fusion.run import Session
+from replay.calibration import estimate_facts
 from replay.config import RunConfig
 from replay.evaluation import Batch, Evaluation
 from replay.plausibility import FASTEST_SPEED, Watch
@@ -63,6 +64,7 @@ class Drive:
         self._watch, self._contents = Watch(land_vehicle=vehicle.land_vehicle), Contents()
         self._left_out, self._noted = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
         self._aligned_ns: int | None = None
+        self._estimates: tuple[Estimated, ...] = ()
 
     def push(self, piece: Log) -> Batch:
         """The next piece (the first comes again). Raises EgolocError where it cannot be used."""
@@ -121,6 +123,7 @@ class Drive:
                 for entry in (*_entries(self._left_out), *_entries(self._noted))
             ],
             "smoothed": self._smoothing is not None,
+            "estimates": estimate_facts(self._estimates),
         }
 
     def _placed(self, piece: Log) -> Log:
@@ -136,7 +139,7 @@ class Drive:
     def _see(self, given: Log, result: FusionResult) -> None:
         self._watch.add(given, result)
         _count(self._noted, result.left_out)
-        self._aligned_ns = result.aligned_ns
+        self._aligned_ns, self._estimates = result.aligned_ns, result.estimates
         speed = np.hypot(result.states.vel_enu[:, 0], result.states.vel_enu[:, 1])
         self.km += float(speed[speed < FASTEST_SPEED].sum()) * self.period_ns / NS_PER_S / 1000.0
 

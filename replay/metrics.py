@@ -48,6 +48,8 @@ def metrics_of(sums: Sums, logs: Mapping[str, Any] | None = None) -> Metrics:
     metrics["slices"] = {kind: _slices(sums, kind) for kind in ("scene", "mode") if segments.tags(kind)}
     metrics["alignment_s"] = counts.alignment_s
     metrics["health"] = health_metrics(counts.health)
+    if logs is None:
+        metrics["estimates"] = counts.estimates
     metrics["decisions"] = counts.decisions
     metrics["left_out"] = counts.left_out
     metrics["warnings"] = counts.warnings

@@ -55,6 +55,7 @@ class Facts(TypedDict):
     warnings: list[dict[str, str]]
     left_out: list[dict[str, str | int]]
     smoothed: NotRequired[bool]
+    estimates: NotRequired[list[dict[str, Any]]]
 
 
 class Manifest(TypedDict):

@@ -173,6 +173,7 @@ class Scorer:
             left_out=facts["left_out"],
             health=facts["health"],
             smoothed=facts.get("smoothed", False),
+            estimates=facts.get("estimates", []),
         )
 
     def _decision_counts(self) -> dict[str, dict[str, int]]:

@@ -64,6 +64,8 @@ class Counts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: int = _FORMAT
     health: dict[str, int] = {}
     """Epochs by state of health (and "state/cause"), and restarts (``replay.health``)."""
+    estimates: list[dict[str, Any]] = []
+    """What a log showed of the calibration (``fusion.calibration``); of several logs: nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

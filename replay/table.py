@@ -8,6 +8,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from replay.calibration import calibration_notes
 from replay.health import health_note
 from replay.segments import AXES, THRESHOLDS
 
@@ -93,6 +94,7 @@ def notes(metrics: Metrics) -> Iterator[str]:
         yield f"Aligned {metrics['alignment_s']:.1f} s after the first IMU sample{within}."
     if metrics["health"]:
         yield health_note(metrics["health"])
+    yield from calibration_notes(metrics.get("estimates", ()))
     for reason, count in metrics["excluded"].items() if metrics["reference"]["kind"] else ():
         yield f"Excluded: {count} epochs: {EXCLUDED_TEXT[reason]}."
     for entry in metrics["left_out"]:

@@ -63,12 +63,28 @@ DAY_STEP_S = 10.0
 
 AS_DRAWN = FusionConfig(
     imu=ImuNoise(noise_scale=1.0),
-    gnss=GnssModel(inflation=1.0, sigma_floor_horizontal_m=0.0, sigma_floor_vertical_m=0.0, sigma_floor_velocity=0.0),
-    pose=PoseModel(inflation=1.0, sigma_floor_m=0.0, sigma_floor_yaw_deg=0.0),
+    gnss=GnssModel(
+        white_share=1.0,
+        lasting_share=0.0,
+        sigma_floor_horizontal_m=0.0,
+        sigma_floor_vertical_m=0.0,
+        sigma_floor_velocity=0.0,
+    ),
+    pose=PoseModel(
+        white_share=1.0, lasting_share=0.0, yaw_offset_sigma_deg=0.0, sigma_floor_m=0.0, sigma_floor_yaw_deg=0.0
+    ),
     motion=MotionModel(zero_velocity=False, non_holonomic=False),
 )
-"""The noise as the simulator draws it: no inflation, no floors, and nothing beside the sensors (the simulated vehicle
-keeps to the constraint exactly, which no stated sigma would say)."""
+"""The white noise as the simulator draws it: no floors, and nothing beside the sensors (the simulated vehicle keeps to
+the constraint exactly, which no stated sigma would say)."""
+AS_LASTING = msgspec.structs.replace(
+    AS_DRAWN,
+    gnss=msgspec.structs.replace(AS_DRAWN.gnss, white_share=0.2, lasting_share=0.8, lasting_s=30.0),
+    pose=msgspec.structs.replace(
+        AS_DRAWN.pose, white_share=0.2, lasting_share=0.8, lasting_m=300.0, yaw_offset_sigma_deg=0.108
+    ),
+)
+"""The same of errors four fifths of whose variance lasts."""
 
 
 @dataclass(frozen=True)
@@ -82,11 +98,13 @@ class Case:
 
 
 def cases() -> tuple[Case, ...]:
-    """White errors that the filter is told of; errors that last; and everything that goes wrong on the road."""
+    """White errors and errors that last, which the filter is told of; the latter, as it takes them by default; and
+    everything that goes wrong on the road."""
     road = load("road-test")
     return (
         Case("white", load("clean"), 100.0, AS_DRAWN),
-        Case("lasting errors", lasting_errors(road), 200.0),
+        Case("lasting errors", lasting_errors(road), 200.0, AS_LASTING),
+        Case("lasting errors, by default", lasting_errors(road), 200.0),
         Case("road-test", road, 200.0),
     )
 

@@ -51,6 +51,8 @@ class Replay:
         Literal["stamp", "arrival"] | None, tyro.conf.arg(help_behavior_hint="(default: the config's, else stamp)")
     ] = None
     """Measurements by when they were true, or as they came: late ones by rewinding, states as they were known then."""
+    estimate: Annotated[str | None, tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: the config's)")] = None
+    """Find these along the way: lever-arm, mounting, gyro, delays (gnss-delay, pose-delay), as in mounting,delays."""
     inject: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
     """Make sensors fail, as in gnss-jump:severe@60+20: NAME[:mild|medium|severe][@BEGIN[+LENGTH]] in s since the first
     IMU sample; several with commas or --inject again. Names: docs/faults.md, or any other word."""
@@ -97,7 +99,7 @@ class Replay:
             raise EgolocError("--resume and --overwrite: expected one of them")
 
     def _settings(self) -> "RunConfig":
-        from replay.config import RunConfig, load_config, named_limits, parse_hide_gnss, with_faults
+        from replay.config import RunConfig, load_config, named_limits, parse_hide_gnss, with_estimates, with_faults
 
         config = RunConfig() if self.config is None else load_config(self.config)
         if self.limits is not None:
@@ -105,6 +107,8 @@ class Replay:
         if self.order is not None:
             fusion = msgspec.structs.replace(config.fusion, order=self.order)
             config = msgspec.structs.replace(config, fusion=fusion)
+        if self.estimate is not None:
+            config = with_estimates(config, self.estimate)
         if self.hide_gnss is not None:
             config = msgspec.structs.replace(config, hide_gnss=parse_hide_gnss(self.hide_gnss))
         if self.smooth:

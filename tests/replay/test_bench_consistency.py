@@ -88,9 +88,9 @@ def test_its_json_and_its_table(capsys: pytest.CaptureFixture[str], monkeypatch:
     assert found["bench"] == "consistency"
     assert found["conditions"]["seeds"] == 2
     named = {(row["name"], row["metric"]): row for row in found["rows"]}
-    assert len(named) == 3 * 7 * 3 + 2
+    assert len(named) == 4 * 7 * 3 + 2
     assert {case for case, _, _ in (name.partition(":") for name, _ in named)} == {
-        *("white", "lasting errors", "road-test", "0.1 h"),
+        *("white", "lasting errors", "lasting errors, by default", "road-test", "0.1 h"),
     }
     assert named["0.1 h", "largest asymmetry"]["max"] < 1e-12
     assert 0 < named["0.1 h", "eigenvalue ratio"]["min"] <= 1

@@ -309,3 +309,30 @@ def test_an_interrupt_is_no_traceback(monkeypatch: pytest.MonkeyPatch, capsys: p
     monkeypatch.setattr("sensors.simulate.scenarios.load", interrupt)
     assert main(["simulate", "demo", "never.mcap"]) == 130
     assert capsys.readouterr().err == "egoloc: interrupted\n"
+
+
+def test_estimates_are_told_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """--estimate switches states on; what the drive shows stands in the notes and, scored again, in metrics.json."""
+    out = tmp_path / "run"
+    arguments = ["replay", "scenario:clean,duration_s=40", "--estimate", "lever-arm,delays", "--out", str(out)]
+    assert main(arguments) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Estimated: wheel scale" in printed
+    assert "GNSS delay" in printed
+    found = {each["name"]: each for each in json.loads((out / "metrics.json").read_text())["estimates"]}
+    assert {"wheel_scale", "gnss_arm_x", "gnss_arm_z", "gnss_delay", "pose_delay"} <= set(found)
+    assert not {"mounting_yaw", "gyro_scale"} & set(found)
+    delay = found["gnss_delay"]
+    assert abs(delay["value"]) < 3.0 * delay["sigma"] < delay["prior_sigma"] == 0.05
+    assert delay["excited"] is True
+    assert "lever_arm = true" in (out / "config.toml").read_text()
+    before = (out / "metrics.json").read_text()
+    assert main(["score", str(out)]) == 0
+    assert (out / "metrics.json").read_text() == before
+
+
+def test_nothing_else_can_be_estimated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["replay", "scenario:clean,duration_s=40", "--estimate", "arm", "--out", str(tmp_path / "run")]
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "--estimate: expected any of lever-arm, mounting, gyro, delays, gnss-delay, pose-delay, got 'arm'" in error
