@@ -39,6 +39,8 @@ pauses of 1.6 s were filled so (of all other rows 99 % differ by more than 0.01)
 BIAS_TIME_CONSTANT_S = 1000.0
 TURN_ON = (5e-5, 0.1)
 """Gyro rad/s and accelerometer m/s^2 biases at the start, as gtsam's own example of this drive assumes."""
+GYRO_SCALE_PPM, GYRO_MISALIGNMENT_DEG = 1000.0, 0.05
+"""The files say nothing of either: figures usual for an inertial unit of this class."""
 
 _IMU = "KittiEquivBiasedImu.txt"
 _METADATA = "KittiEquivBiasedImu_metadata.txt"
@@ -119,4 +121,6 @@ def _imu_spec(path: Path) -> ImuSpec:
         bias_time_constant_s=BIAS_TIME_CONSTANT_S,
         gyro_turn_on_bias_deg_per_h=TURN_ON[0] * deg_per_h,
         accel_turn_on_bias_mg=TURN_ON[1] / mg,
+        gyro_scale_ppm=GYRO_SCALE_PPM,
+        gyro_misalignment_deg=GYRO_MISALIGNMENT_DEG,
     )
