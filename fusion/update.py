@@ -103,10 +103,10 @@ def _apply_position(
     threshold = threshold_of(core, par, dof, now) if which else par.gate[dof - 1]
     passed = _apply(core, rec, par, k, dof, threshold, accepted)
     first = par.layout.pose_error if which else par.layout.gnss_error
-    # what lasted may have changed all at once: then the state need not move for it
-    if not passed and first >= 0 and may_renew(core, which):
+    if not passed and first >= 0:
+        # what lasted may have changed all at once: then the state need not move for it
         dof, accepted = measure(core, par, m, kind, ev.row[e], rate, False)
-        known = innovate(core.P, core.H, core.W, dof, core.R, core.L)
+        known = may_renew(core, which) and innovate(core.P, core.H, core.W, dof, core.R, core.L)
         if known and whiten(dof, core.residual, core.L) <= threshold:
             renew(core, first)
             dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
