@@ -19,6 +19,7 @@ from fusion.history import (
     I_ROW,
     I_T,
     I_VERDICT,
+    M_DECIDED,
     M_EVENTS,
     M_FREE,
     M_LENGTH,
@@ -130,7 +131,7 @@ def _lay_grid(core: Core, history: History, rec: Recorder, stamps: Nanoseconds, 
         if mark[M_EVENTS] + 2 > len(history.arrival_ns):
             _make_room(core, history, rec, stamps)
         if t == tick:
-            _insert(history, t, MOTION, -1, _APPLY, t, -1)
+            _insert(history, t, MOTION, -1, AGAIN if t <= mark[M_DECIDED] else _APPLY, t, -1)
             mark[M_TICK] += mark[M_TICK_PERIOD]
         if t == mark[M_OUTPUT]:
             _insert(history, t, OUTPUT, -1, AGAIN if t <= mark[M_SILENT] else _APPLY, t, -1)

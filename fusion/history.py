@@ -36,7 +36,8 @@ PLAYED = 64
     M_START,
     M_SILENT,
     M_LENGTH,
-) = range(11)
+    M_DECIDED,
+) = range(12)
 
 # columns of History.inbox
 I_T, I_KIND, I_ROW, I_VERDICT, I_DUE, I_ARRIVAL, I_LOG_ROW = range(7)
@@ -53,8 +54,9 @@ class Samples(NamedTuple):
 class History(NamedTuple):
     """What the filter plays again.
 
-    mark (11,) int64: IMU samples so far, events, the first event not met, free rows, the next output and motion tick
-    ns, their periods ns (0: none), time of the first state ns, outputs up to this time are not recorded ns, length ns.
+    mark (12,) int64: IMU samples so far, events, the first event not met, free rows, the next output and motion tick
+    ns, their periods ns (0: none), time of the first state ns, outputs up to this time are not recorded ns, length ns;
+    motion ticks up to this time were decided before a new start ns.
     samples (N,): a ring with the slots of Core.ring; played: the same memory, to be read.
     events (E,): sorted by time and kind, the first ``mark[M_EVENTS]`` of them; arrival_ns, log_row (E,): of each.
     m: the measurements' columns (E + NEW rows); free (E + NEW,): their rows that no event needs.
@@ -81,7 +83,7 @@ def new_history(ring: int, columns: Measurements, length_s: float) -> History:
     """An empty history. ring: slots of Core.ring; columns: of ``columns_for``."""
     size = _events_in(length_s)
     samples = Samples(np.zeros(ring, np.int64), np.zeros((ring, 3)), np.zeros((ring, 3)))
-    mark = np.zeros(11, np.int64)
+    mark = np.zeros(12, np.int64)
     mark[M_LENGTH], mark[M_FREE] = round(length_s * NS_PER_S), size + NEW
     return History(
         mark=mark,

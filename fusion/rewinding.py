@@ -16,6 +16,7 @@ from fusion.config import FusionConfig
 from fusion.events import Measurements
 from fusion.health import begin
 from fusion.history import (
+    M_DECIDED,
     M_EVENTS,
     M_NEXT,
     M_OUTPUT,
@@ -74,8 +75,8 @@ class RewindingNavigator(Navigator):
         self._last_due = NEVER
         self._seen_ns = NEVER
         """Stamp of the newest sample that alignment has had."""
-        self._since_ns = NEVER
-        """When the filter gave up last."""
+        self._since_ns = self._decided_ns = NEVER
+        """When the filter gave up last; up to when motion ticks were decided by then."""
         self._offered: dict[int, int] = {}
         """Of each sensor, the newest measurement that alignment has had."""
         self._history: History | None = None
@@ -225,7 +226,8 @@ class RewindingNavigator(Navigator):
         mark[M_OUTPUT_PERIOD], mark[M_OUTPUT] = output, (initial.t_ns // output + 1) * output
         if tick:
             mark[M_TICK_PERIOD], mark[M_TICK] = tick, (initial.t_ns // tick + 1) * tick
-        mark[M_START], mark[M_SILENT] = initial.t_ns, max(silent_ns, self._seen_ns)
+        mark[M_START], mark[M_DECIDED] = initial.t_ns, self._decided_ns
+        mark[M_SILENT] = max(silent_ns, self._seen_ns)
 
     def _run(self, imu: Imu, imu_due: Nanoseconds, known_ns: int) -> bool:
         """Give the kernel samples and pending measurements up to known_ns, by when they are due; False: it gave up."""
@@ -281,7 +283,7 @@ class RewindingNavigator(Navigator):
         seen_ns = [NEVER, *again.t_ns.tolist()][-1]
         last_imu, last_found = (int(due[n - 1]) if n else NEVER for due, n in ((imu_due, i), (self._due_of(found), j)))
         if last_found > last_imu:  # a late one: states over the samples after it are known
-            self._seen_ns = max(self._seen_ns, seen_ns)
+            self._seen_ns = self._decided_ns = max(self._seen_ns, seen_ns)
         now_ns = max(last_imu, last_found, seen_ns)
         self._wait(again, np.full(len(again), now_ns))
         self._wait(imu[i:], np.maximum.accumulate(np.maximum(imu_due[i:], now_ns)))

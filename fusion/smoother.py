@@ -31,6 +31,9 @@ from sensors.kernel import kernel
 from sensors.records import Log
 
 _SECOND = NS_PER_S
+_ROUNDING = 1e-9
+"""Share of P that is added to P - P Lambda P: rounding takes up to half of it where P falls from 800 m to a centimetre
+at once, and would leave less than nothing."""
 
 
 @kernel()
@@ -214,6 +217,8 @@ def _smooth(tape: Floats, end: int, core: Core, lam: Floats, Lam: Floats, work: 
             for j in range(size):
                 smoothed[i, j] -= gain[i, k] * P[k, j]
     _mirror(smoothed)
+    for i in range(size):
+        smoothed[i, i] += _ROUNDING * P[i, i]
     for i in range(size):
         for j in range(size):
             P[i, j] = smoothed[i, j]

@@ -31,9 +31,10 @@ _SECOND = NS_PER_S
 
 PORTION = 1 << 20
 """Numbers that a portion of a drive may put on the tape: 8 MB of memory."""
-_CORRECTIONS = 3
-_FADES = 8
-"""At most, at one event."""
+_CORRECTIONS = 2
+_FADES = 6
+"""At most, at one event: zero rate and zero velocity, of which one is a correction each; a position's lasting error
+moved on, met once more after it was renewed, and all states and both lasting errors where the state starts again."""
 
 
 @kernel()

@@ -104,13 +104,7 @@ def _apply_position(
     passed = _apply(core, rec, par, k, dof, threshold, accepted)
     first = par.layout.pose_error if which else par.layout.gnss_error
     if not passed and first >= 0:
-        # what lasted may have changed all at once: then the state need not move for it
-        dof, accepted = measure(core, par, m, kind, ev.row[e], rate, False)
-        known = may_renew(core, which) and innovate(core.P, core.H, core.W, dof, core.R, core.L)
-        if known and whiten(dof, core.residual, core.L) <= threshold:
-            renew(core, first)
-            dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
-            passed = _apply(core, rec, par, k, dof, threshold, accepted)
+        passed, dof, accepted = _apply_renewed(core, rec, par, m, ev, e, rate, k, (threshold, first))
     if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
         tally(core, par, which, passed, now)
     if dof == 3:
@@ -121,6 +115,35 @@ def _apply_position(
         else:
             doubted(core, par, 0, triple(rec.innovation, k), (1.0, 0.0), now)
     return passed, dof
+
+
+@kernel()
+def _apply_renewed(
+    core: Core,
+    rec: Recorder,
+    par: Parameters,
+    m: Measurements,
+    ev: Events,
+    e: int,
+    rate: Vector,
+    k: int,
+    judged: tuple[float, int],
+) -> tuple[bool, int, int]:
+    """A position that was rejected once more: what lasts of its error may have changed all at once, and then the state
+    need not move for it. Seldom, so it is compiled for itself.
+
+    judged: the threshold, and where the states of what lasts begin. Returns what ``measure`` gives, after whether the
+    position passed.
+    """
+    threshold, first = judged
+    kind, row, passed = ev.kind[e], ev.row[e], False
+    dof, accepted = measure(core, par, m, kind, row, rate, False)
+    known = may_renew(core, int(kind == _POSE_FIX)) and innovate(core.P, core.H, core.W, dof, core.R, core.L)
+    if known and whiten(dof, core.residual, core.L) <= threshold:
+        renew(core, first)
+        dof, accepted = measure(core, par, m, kind, row, rate, True)
+        passed = _apply(core, rec, par, k, dof, threshold, accepted)
+    return passed, dof, accepted
 
 
 @kernel(inline="always")

@@ -1,7 +1,6 @@
 """A new start in arrival order: where nothing is late that of stamp order, however it is fed; late fixes around it."""
 
 from dataclasses import replace
-from functools import cache
 
 import msgspec
 import numpy as np
@@ -27,13 +26,13 @@ from tests.fusion.arrivals import (
     records_by_arrival,
     scattered,
 )
-from tests.fusion.scenes import later, only, seconds, with_outage, without
+from tests.fusion.scenes import later, only, seconds, with_outage, without, without_yaw
 from tests.fusion.test_live import assert_equal_replay
-from tests.fusion.test_restart import BEGIN_S, drive_of, gnss_alone
 from tests.fusion.test_session import assert_same, cuts_of, in_pieces, pieces
 
-CONFIG = msgspec.structs.replace(LATE, health=HealthModel(blown_sigma_m=1.0))
-"""A state that is not known to a metre counts as diverged: the fix that shows it begins a new alignment."""
+CONFIG = msgspec.structs.replace(LATE, health=HealthModel(blown_sigma_m=0.12))
+"""A state that is not known to twelve centimetres counts as diverged: the fix that shows it begins a new alignment."""
+SECOND = 10**9
 FIXES = ("gnss", "gnss_velocity", "pose_fixes")
 OUTAGES = (32.0, 56.0)
 """Ends, s."""
@@ -49,18 +48,21 @@ def log() -> Log:
     return drive
 
 
-@cache
-def far_off() -> Log:
-    """Five minutes without positions, then GNSS alone that contradicts the state by far."""
-    drive = drive_of("automotive", 300.0, 1)
-    return gnss_alone(with_outage(replace(drive.log, wheel=None), BEGIN_S, 300.0))
+def jumped(log: Log) -> Log:
+    """GNSS alone, which is 300 m off from one second to the next, and stays there."""
+    drive = without_yaw(replace(later(log, 40.0), pose_fixes=None, wheel=None))
+    assert drive.gnss is not None
+    away = np.where(seconds(drive, drive.gnss.t_ns) > 30.0, 300.0 / 6.37e6, 0.0)
+    return replace(drive, gnss=replace(drive.gnss, llh=drive.gnss.llh + away[:, None] * [1.0, 0.0, 0.0]))
 
 
 def decided_once(log: Log, result: FusionResult) -> bool:
-    rows = np.column_stack((result.decisions.sensor, result.decisions.row))
-    yaws = 0 if log.gnss is None else int(np.isfinite(log.gnss.yaw).sum())
+    made = result.decisions
+    measured = made.sensor < Sensor.ZERO_VELOCITY
+    rows = np.column_stack((made.sensor, made.row))[measured]
     count = sum(len(record) for name in MEASURED if (record := getattr(log, name)) is not None)
-    return len(np.unique(rows, axis=0)) == len(rows) == count + yaws
+    ticks = made.t_ns[~measured]
+    return len(np.unique(rows, axis=0)) == len(rows) == count and len(np.unique(ticks)) == len(ticks)
 
 
 def test_where_nothing_is_late_a_new_start_is_that_of_stamp_order(log: Log) -> None:
@@ -74,11 +76,15 @@ def test_where_nothing_is_late_a_new_start_is_that_of_stamp_order(log: Log) -> N
 
 
 def test_a_state_that_gnss_contradicts_starts_again_as_in_stamp_order() -> None:
-    drive = at_once(far_off())
-    result = run(drive, LATE)
-    assert_same(result, run(drive, in_stamp_order(LATE)))
+    health = HealthModel(lost_s=1.0, alone_s=1.5)
+    drive, config = (
+        at_once(jumped(simulate(110.0, 2, scenarios.load("demo")))),
+        msgspec.structs.replace(LATE, health=health),
+    )
+    result = run(drive, config)
+    assert_same(result, run(drive, in_stamp_order(config)))
     assert [restart.cause for restart in result.restarts] == [Cause.REJECTED]
-    assert_equal_replay(drive, LATE)
+    assert_equal_replay(drive, config)
 
 
 @pytest.mark.parametrize("late", [False, True], ids=["in time", "late"])
@@ -136,6 +142,17 @@ def test_late_fixes_start_it_again_where_they_were_true(log: Log) -> None:
     assert_same_state(core_after(drive, CONFIG), core_after(at_once(log), CONFIG))
 
 
+def test_fixes_that_are_later_than_a_new_start_takes(log: Log) -> None:
+    """Three seconds late: the new state begins before states and ticks that the old one has given."""
+    config = msgspec.structs.replace(CONFIG, history_s=5.0)
+    drive = arriving(log, lambda t: np.full(len(t), 3 * SECOND), FIXES)
+    result = run(drive, config)
+    assert len(result.restarts) == 2
+    assert decided_once(drive, result)
+    assert (np.diff(result.states.t_ns) > 0).all()
+    assert_same_state(core_after(drive, config), core_after(at_once(log), config))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_what_was_applied_before_is_decided_once(log: Log, seed: int) -> None:
     """Latencies drawn for each row: a rewind finds the filter hopeless at a fix before rows that were applied."""
@@ -155,9 +172,9 @@ def test_a_fix_from_before_the_new_start_changes_nothing(log: Log) -> None:
     (first, _), velocity = run(base, config).restarts, log.gnss_velocity
     again = run(base, config).states.t_ns
     begun = int(again[np.searchsorted(again, first.t_ns, side="right")])
-    assert begun - first.t_ns < 2 * 10**9
+    assert begun - first.t_ns < 2 * SECOND
     rows = np.flatnonzero((velocity.t_ns > first.t_ns) & (velocity.t_ns < begun - 10**8))
-    late = replace(velocity[rows], arrival_ns=np.full(len(rows), begun + 10**9))
+    late = replace(velocity[rows], arrival_ns=np.full(len(rows), begun + SECOND))
     result = run(replace(base, gnss_velocity=late), config)
     mine = result.decisions.sensor == Sensor.GNSS_VELOCITY
     assert mine.sum() == len(rows) >= 5
@@ -173,7 +190,7 @@ def assert_unmoved(one: FusionResult, other: FusionResult) -> None:
 
 
 def test_without_restart_it_goes_on(log: Log) -> None:
-    config: FusionConfig = msgspec.structs.replace(CONFIG, health=HealthModel(blown_sigma_m=1.0, restart=False))
+    config: FusionConfig = msgspec.structs.replace(CONFIG, health=HealthModel(blown_sigma_m=0.12, restart=False))
     drive = at_once(log)
     result = run(drive, config)
     assert result.restarts == ()
