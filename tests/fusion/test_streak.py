@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusion.config import FusionConfig, Gates
+from fusion.config import FusionConfig, Gates, HealthModel
 from fusion.result import FusionResult, Reason, Sensor
 from fusion.run import run
 from fusion.state import D_HELD, D_LAST, D_STREAK, Core, new_core
@@ -20,7 +20,7 @@ from tests.fusion.free import Floats
 from tests.fusion.rough import LIMITS, fused_errors, off
 from tests.fusion.scenes import seconds, with_outage, without
 
-PLAIN_GATE = FusionConfig(gates=Gates(streak=10**9))
+NO_STREAK = Gates(streak=10**9)
 """Whatever P explains passes, however the streak began."""
 ALL = ("gnss", "gnss_velocity", "pose_fixes")
 
@@ -54,20 +54,24 @@ def reasons(log: Log, result: FusionResult, sensor: Sensor, begin_s: float, end_
 
 
 def with_gross_frames(log: Log, begin_s: float, end_s: float) -> Log:
-    """Bursts of three pose fixes eight metres off, every four seconds."""
+    """Bursts of three pose fixes twenty metres off, every four seconds."""
     fixes = log.pose_fixes
     assert fixes is not None
     s = seconds(log, fixes.t_ns)
     inside = (s >= begin_s) & (s < end_s) & (s % 4.0 < 0.3)
-    return replace(log, pose_fixes=replace(fixes, pose=fixes.pose + np.where(inside[:, None], [8.0, 0.0, 0.0], 0.0)))
+    return replace(log, pose_fixes=replace(fixes, pose=fixes.pose + np.where(inside[:, None], [20.0, 0.0, 0.0], 0.0)))
 
 
 @pytest.mark.parametrize("gross", [False, True], ids=["", "gross frames in between"])
 def test_a_steady_lane_alias_does_not_capture_the_filter(drive: Drive, gross: bool) -> None:
-    """Two minutes without GNSS, with fixes one lane off from five seconds on: P grows until a plain gate gives in."""
+    """Two minutes without GNSS, with fixes one lane off from five seconds on: P grows until a plain gate gives in.
+
+    Among gross frames the filter must not start again: after a minute one of them would do, and the next is the alias.
+    """
     log = a_lane_off(without_gnss(drive.log, 60.0, 190.0), 65.0, 185.0)
     log = with_gross_frames(log, 70.0, 184.0) if gross else log
-    result = run(log)
+    health = HealthModel(restart=not gross)
+    result = run(log, FusionConfig(health=health))
     s = seconds(log, result.states.t_ns)
     alias = (s > 66.0) & (s < 185.0)
     assert (reasons(log, result, Sensor.POSE_FIX, 65.0, 185.0) == Reason.CHI_SQUARE).all()
@@ -75,7 +79,7 @@ def test_a_steady_lane_alias_does_not_capture_the_filter(drive: Drive, gross: bo
     # right fixes are believed at once, and the drive ends within the limits
     assert (reasons(log, result, Sensor.POSE_FIX, 185.5, 190.0) == Reason.ACCEPTED).all()
     assert (np.abs(fused_errors(result, drive)[s > 186.0]) < LIMITS).all()
-    captured = np.abs(fused_errors(run(log, PLAIN_GATE), drive)[alias, :2]).max()
+    captured = np.abs(fused_errors(run(log, FusionConfig(gates=NO_STREAK, health=health)), drive)[alias, :2]).max()
     assert captured > 3.3
 
 
@@ -166,12 +170,12 @@ def test_one_wrong_rejection_is_no_doom(seed: int, claimed_m: float, status: Gns
     before, after, back = led(drive, alone)
     assert before > 1.0
     assert (reasons(alone, run(alone), Sensor.GNSS_POSITION, 104.0, 105.0) == Reason.CHI_SQUARE).all()
-    assert after < (2.0 if status == GnssStatus.FLOAT else 25.0)
+    assert after < (2.0 if status == GnssStatus.FLOAT else 50.0)
     assert back < 30.0
     both = replace(alone, pose_fixes=without(drive.log.pose_fixes, drive.log, 60.0, 104.0))
     before, after, back = led(drive, both)
     assert before > 1.0
-    assert after < before + 1.0
+    assert after < before + 2.0
     assert back < 2.0
 
 
