@@ -1,5 +1,7 @@
 """How a state that must be wrong gives way: P widens to what contradicts it."""
 
+import math
+
 from fusion.state import E_WHEEL_SCALE, Floats
 from sensors.kernel import kernel
 
@@ -61,10 +63,11 @@ def give_way(P: Floats, doubt: Floats) -> None:
 
 @kernel()
 def give_way_turning(P: Floats, turn: float) -> None:
-    """Widen the yaw by how far it is off, rad, the gyro's bias, which may have turned it while votes were counted, and
-    the tilt, which went through the same turn."""
+    """Widen the yaw by how far it is off, rad, the gyro's bias, which may have turned it while votes were counted, the
+    tilt, which went through the same turn, and the scale of the wheel, which was learned across the vehicle's axis."""
     P[8, 8] += turn * turn + ATTITUDE_VAR
     P[11, 11] += 0.25 * turn * turn
+    P[E_WHEEL_SCALE, E_WHEEL_SCALE] += (1.0 - math.cos(turn)) ** 2 + WHEEL_SCALE_VAR
     P[6, 6] += ATTITUDE_VAR
     P[7, 7] += ATTITUDE_VAR
 

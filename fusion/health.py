@@ -172,5 +172,6 @@ def hopeless(core: Core, limits: HealthLimits, sensor: int, now: int) -> bool:
             return False
         if not outweighed(core, limits):
             return False
-    gave_way(clock, limits.settled_ns, False, now)
+    alone = cause == _REJECTED and not (heard(core, _GNSS) and heard(core, _POSE))
+    gave_way(clock, limits.settled_ns, alone, now)
     return True

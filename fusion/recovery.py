@@ -92,6 +92,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     if which == 0 and clock[0, D_COUNT] > 0 and _alone(core, now):
         if clock[0, D_TIME] - clock[0, D_SINCE] < LONG_NS <= now - clock[0, D_SINCE]:
             doubt_all(core.P)
+            core.slipped[:] = 0.0
         forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9)
     if clock[which, D_COUNT] == 0:
         clock[which, D_SINCE] = now
@@ -106,6 +107,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
                 give_way_upwards(core.P, z[2], climb)
             else:
                 give_way_turning(core.P, z[2])
+                core.slipped[:] = 0.0  # learned with a wrong yaw, it would hold on to it
             clock[which, D_COUNT] = 0
         return
     age = (now - clock[1 - which, D_TIME]) * 1e-9
@@ -123,6 +125,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     clock[0, D_AGREED] = max(clock[0, D_AGREED] + (1 if agree else -2), 0)
     if clock[0, D_AGREED] >= par.outvoted:
         give_way(core.P, doubt)
+        core.slipped[:] = 0.0
         if gave_way(core.health, par.health.settled_ns, False, now):
             core.health[H_OUTVOTED] = now
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0

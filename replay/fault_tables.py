@@ -79,7 +79,7 @@ def notes(found: Matrix) -> Iterator[str]:
     """What was done and what the words mean, one line each."""
     seeds = ", ".join(map(str, found.seeds))
     yield f"Scenario clean, {found.duration_s:g} s, seeds {seeds}: the worst drive, from the fault's begin to the end."
-    yield f"astray: beyond a limit and {SIGMAS:g} sigmas in some epoch; says so: the states were not said to be healthy."
+    yield f"astray: beyond a limit and {SIGMAS:g} sigmas in some epoch; says so: no state was healthy then."
     yield f"SILENT: it was said to be healthy, or recovered, for more than {ALERT_S:g} s meanwhile."
     yield "lost: not back within the limits, nor within twice the error without the fault, before the drive ends."
     yield "out, knows it: beyond a limit for a while, within its own sigmas."
