@@ -257,6 +257,10 @@ class HealthModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Over so long or longer no position was explained by the state: diverged, s."""
     lost_count: Annotated[int, msgspec.Meta(ge=1)] = 10
     """And over so many positions or more, -."""
+    contradicted_s: Positive = 1.5
+    """Positions of two sensors need contradict the state for no longer than this to call it diverged, s."""
+    settled_s: NonNegative = 30.0
+    """So long after it gave way to one sensor alone, or to two again, the filter is degraded (unsettled), s."""
     max_speed: Positive = 150.0
     """A land vehicle that is faster has diverged, m/s."""
     max_tilt_deg: Positive = 60.0

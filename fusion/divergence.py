@@ -10,6 +10,7 @@ from fusion.state import (
     H_COUNT,
     H_HELD,
     H_LAST,
+    H_OUTVOTED,
     H_SINCE,
     H_WIDE,
     NAV_SIZE,
@@ -41,6 +42,8 @@ class HealthLimits(NamedTuple):
     sigma_yaw_var: float
     lost_ns: int
     lost: int
+    contradicted_ns: int
+    settled_ns: int
     max_speed2: float
     least_upright: float
     blown_var: float
@@ -74,16 +77,21 @@ def divergence(core: Core, limits: HealthLimits) -> int:
 
 @kernel()
 def lost(core: Core, limits: HealthLimits) -> bool:
-    """Whether positions contradict the state for too long: two sensors, one by far, or one for very long.
+    """Whether positions contradict the state: two sensors for a second or by a second vote, one for longer and by far,
+    or for very long.
 
     What one sensor says, not far from the state and not for so long, may be a wrong fix or an alias of the map.
     """
     clock = core.health
     lasts = clock[H_LAST] - clock[H_SINCE]
-    if clock[H_COUNT] < limits.lost or lasts < limits.lost_ns:
+    if outvoted_again(core):
+        return True
+    both = heard(core, _GNSS) and heard(core, _POSE)
+    if clock[H_COUNT] < limits.lost or lasts < (limits.contradicted_ns if both else limits.lost_ns):
         return False
-    both = _heard(core, _GNSS) and _heard(core, _POSE)
-    return bool(both or lasts >= limits.alone_ns or _off(core) > limits.far_m or _doubtful(core, limits))
+    if both:
+        return True
+    return bool(lasts >= limits.alone_ns or _off(core) > limits.far_m or _doubtful(core, limits))
 
 
 @kernel()
@@ -102,10 +110,17 @@ def _doubtful(core: Core, limits: HealthLimits) -> bool:
 
 
 @kernel()
-def _heard(core: Core, sensor: int) -> bool:
+def outvoted_again(core: Core) -> bool:
+    """Whether the positions that were not explained of late have outvoted the state, not for the first time."""
+    again: bool = core.health[H_COUNT] > 0 and core.health[H_OUTVOTED] >= core.health[H_SINCE]
+    return again
+
+
+@kernel()
+def heard(core: Core, sensor: int) -> bool:
     """Whether positions of this sensor are among those that were not explained of late."""
-    heard: bool = core.trust[sensor, T_SEEN] >= core.health[H_SINCE]
-    return heard
+    lately: bool = core.trust[sensor, T_SEEN] >= core.health[H_SINCE]
+    return lately
 
 
 @kernel()
@@ -113,7 +128,7 @@ def _off(core: Core) -> float:
     """How far off the state is by the sensor that says least, m."""
     least = math.inf
     for which, sensor in ((0, _GNSS), (1, _POSE)):
-        if _heard(core, sensor):
+        if heard(core, sensor):
             least = min(least, math.hypot(core.doubt[which, 0], core.doubt[which, 1]))
     return least
 
@@ -122,16 +137,18 @@ def _off(core: Core) -> float:
 def outweighed(core: Core, limits: HealthLimits) -> bool:
     """Whether what contradicts a lost state weighs more than the state does: then it had better begin anew.
 
-    Two sensors that roughly agree on a place far off do; GNSS alone does where the state is weak or after very long;
-    pose fixes alone only from far off: nearer, an alias of the map is as steady as the truth.
+    Two sensors that outvoted it again, or roughly agree on a place far off, do; GNSS alone does where the state is
+    weak or after very long; pose fixes alone only from far off: nearer, an alias of the map is as steady as the truth.
     """
+    if outvoted_again(core):
+        return True
     clock = core.health
     off = _off(core)
     far = off > limits.far_m
-    if _heard(core, _GNSS) and _heard(core, _POSE):
+    if heard(core, _GNSS) and heard(core, _POSE):
         gnss, pose = core.doubt[0], core.doubt[1]
         return bool(far and math.hypot(gnss[0] - pose[0], gnss[1] - pose[1]) <= AGREEMENT * off)
     if far and _weak(core, limits):
         return True
     long = clock[H_LAST] - clock[H_SINCE] >= limits.alone_ns
-    return bool(_heard(core, _GNSS) and (long or _doubtful(core, limits)))
+    return bool(heard(core, _GNSS) and (long or _doubtful(core, limits)))

@@ -5,19 +5,21 @@ those that it does not, its own sigmas, and what no vehicle can do. The clocks l
 ``Core.trust``) and change with every measurement, so that pieces, streaming and rewinding give the same bits.
 """
 
-from fusion.divergence import HealthLimits, divergence, outweighed
+from fusion.divergence import HealthLimits, divergence, heard, outvoted_again, outweighed
 from fusion.result import Cause, Health, Level, Sensor
 from fusion.state import (
     H_BACK,
     H_CAUSE,
     H_COUNT,
     H_FED,
+    H_GAVE,
     H_HELD,
     H_LAST,
     H_RESTARTS,
     H_SINCE,
     H_START,
     H_STATE,
+    H_UNSETTLED,
     H_WIDE,
     T_DOUBT,
     T_GOOD,
@@ -34,6 +36,7 @@ SOURCES = (Sensor.GNSS_POSITION, Sensor.GNSS_VELOCITY, Sensor.GNSS_YAW, Sensor.P
 _HEALTHY, _DEGRADED, _RECOVERED = int(Health.HEALTHY), int(Health.DEGRADED), int(Health.RECOVERED)
 _DEAD_RECKONING, _DIVERGED = int(Health.DEAD_RECKONING), int(Health.DIVERGED)
 _NONE, _SIGMA, _REJECTED, _TILTED = int(Cause.NONE), int(Cause.SIGMA), int(Cause.REJECTED), int(Cause.TILTED)
+_UNSETTLED = int(Cause.UNSETTLED)
 _ABSENT, _STALE, _SUSPECT, _GOOD = (int(level) for level in Level)
 _GNSS, _YAW, _POSE = int(Sensor.GNSS_POSITION), int(Sensor.GNSS_YAW), int(Sensor.POSE_FIX)
 _COUNT = len(SOURCES)
@@ -46,6 +49,7 @@ def begin(core: Core, now: int, before: Core | None) -> None:
     clock[H_STATE] = _HEALTHY
     if before is not None:
         clock[H_BACK], clock[H_RESTARTS] = now, before.health[H_RESTARTS] + 1
+        clock[H_GAVE], clock[H_UNSETTLED] = before.health[H_GAVE], before.health[H_UNSETTLED]
         core.trust[:, T_SEEN], core.trust[:, T_GOOD] = before.trust[:, T_SEEN], before.trust[:, T_GOOD]
         core.quietest[:] = before.quietest
 
@@ -75,6 +79,19 @@ def noted(
         clock[H_SINCE] = now
     clock[H_COUNT] += 1
     clock[H_LAST] = now
+
+
+@kernel()
+def gave_way(clock: Nanoseconds, settled: int, alone: bool, now: int) -> bool:
+    """The state gave way to positions that contradicted it; whether it had done so shortly before.
+
+    clock: Core.health; settled: what is shortly, ns; alone: to those of one sensor, which may have been wrong.
+    """
+    again: bool = now - clock[H_GAVE] <= settled
+    if alone or again:
+        clock[H_UNSETTLED] = now
+    clock[H_GAVE] = clock[H_BACK] = now
+    return again
 
 
 @kernel()
@@ -112,7 +129,9 @@ def judge(core: Core, limits: HealthLimits, now: int) -> None:
 
 @kernel()
 def _weakness(core: Core, limits: HealthLimits, now: int) -> int:
-    """The Cause for which the state is less than healthy: the first sensor that is not good; NONE."""
+    """The Cause for which the state is less than healthy: that it gave way, or the first sensor not good; NONE."""
+    if now - core.health[H_UNSETTLED] <= limits.settled_ns:
+        return _UNSETTLED
     for sensor in range(_COUNT):
         if _ABSENT < level_of(core.trust, limits.stale_ns[sensor], limits.suspect, sensor, now) < _GOOD:
             return sensor + 1
@@ -131,24 +150,28 @@ def questionable(clock: Nanoseconds, P: Floats, limits: HealthLimits) -> bool:
 def hopeless(core: Core, limits: HealthLimits, sensor: int, now: int) -> bool:
     """Whether a position that comes now should rather begin a new alignment than be judged by this state.
 
-    sensor: GNSS position or pose fix. Not within a pause after a start, which grows with their number; and not for its
-    tilt, which gravity gives again.
+    sensor: GNSS position or pose fix. Not within a pause after a start, which grows with their number, unless it was
+    outvoted again; and not for its tilt, which gravity gives again.
     """
     clock, nav = core.health, core.nav
     if core.P[8, 8] > limits.wide_yaw_var:
         clock[H_WIDE] = now
     if not limits.restart:
         return False
-    if now - clock[H_START] < limits.pause_ns * (1 + clock[H_RESTARTS]):
+    if now - clock[H_START] < limits.pause_ns * (1 + clock[H_RESTARTS]) and not outvoted_again(core):
         return False
     cause = divergence(core, limits)
     if cause in (_NONE, _TILTED):
         return False
     judge(core, limits, now)
-    if cause != _REJECTED:
-        return True
-    # else the new yaw will be a course
-    has_yaw = sensor == _POSE or level_of(core.trust, limits.stale_ns[_YAW], limits.suspect, _YAW, now) > _STALE
-    if not has_yaw and nav[3] * nav[3] + nav[4] * nav[4] < limits.course_speed2:
-        return False
-    return bool(outweighed(core, limits))
+    if cause == _REJECTED:
+        # without these the new yaw will be a course
+        yaw = level_of(core.trust, limits.stale_ns[_YAW], limits.suspect, _YAW, now) > _STALE
+        has_yaw = sensor == _POSE or heard(core, _POSE) or yaw
+        if not has_yaw and nav[3] * nav[3] + nav[4] * nav[4] < limits.course_speed2:
+            return False
+        if not outweighed(core, limits):
+            return False
+    alone = cause == _REJECTED and not (heard(core, _GNSS) and heard(core, _POSE))
+    gave_way(clock, limits.settled_ns, alone, now)
+    return True

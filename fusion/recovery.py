@@ -4,16 +4,17 @@ A rejection alone proves nothing: a wrong fix and an alias of the map are as ste
 sensors that say the same place, while neither was accepted in between, outvote the state. Where GNSS is alone the
 state's confidence decays as long as it is contradicted: what is little off is soon believed, a wrong fix a hundred
 sigmas away not before it has ended. Height and yaw, of which one sensor alone may know, give way to it where all else
-fits. Outvoted again soon, the state starts again.
+fits. Outvoted again soon, the state is given up (``fusion.divergence``).
 """
 
 import math
 
 from fusion._linalg import Vector, attitude, matvec
 from fusion.events import Parameters
-from fusion.giving_way import doubt_all, forget, give_way, give_way_turning, give_way_upwards, start_again
+from fusion.giving_way import doubt_all, forget, give_way, give_way_turning, give_way_upwards
+from fusion.health import gave_way
 from fusion.measurements import Pair, wrap
-from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_GAVE, D_SINCE, D_STREAK, D_TIME, Core
+from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_SINCE, D_STREAK, D_TIME, H_OUTVOTED, Core
 from sensors.kernel import kernel
 
 FRESH_NS = 500_000_000
@@ -31,16 +32,33 @@ LONG_NS = 8_000_000_000
 """After so long the biases are doubted as well."""
 COURSE_SPEED, COURSE_NEAR = 3.0, 0.05
 """At this speed and more a vehicle's course is its yaw to within so much, m/s, rad."""
-AGAIN_NS = 10_000_000_000
-"""A state that is outvoted again within this is not mended by a wider P: it starts again."""
 
 
 @kernel()
-def believed(core: Core, which: int, now: int) -> None:
-    """A position of sensor which (0 GNSS, 1 pose fix) was accepted."""
+def believed(core: Core, par: Parameters, which: int, z: Vector, now: int) -> None:
+    """A position of sensor which (0 GNSS, 1 pose fix) was accepted, with innovation z."""
+    if which == 0 and _goes_on(core, par, z, now):
+        gave_way(core.health, par.health.settled_ns, True, now)
     core.doubt_clock[which, D_COUNT] = 0
     core.doubt_clock[which, D_BELIEVED] = now
     core.doubt_clock[0, D_AGREED] = 0
+
+
+@kernel()
+def _goes_on(core: Core, par: Parameters, z: Vector, now: int) -> bool:
+    """Whether GNSS alone, accepted now, says what it said while it was rejected: then it is the state that gave way."""
+    clock, said = core.doubt_clock, core.doubt[0]
+    if clock[0, D_COUNT] == 0 or now - clock[0, D_SINCE] < par.health.contradicted_ns or not _alone(core, now):
+        return False
+    near: bool = math.hypot(z[0] - said[0], z[1] - said[1]) < 0.5 * math.hypot(said[0], said[1])
+    return near
+
+
+@kernel()
+def _alone(core: Core, now: int) -> bool:
+    """Whether no pose fix came of late."""
+    alone: bool = now - max(core.doubt_clock[1, D_TIME], core.doubt_clock[1, D_BELIEVED]) > ALONE_NS
+    return alone
 
 
 @kernel()
@@ -71,9 +89,10 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     mine[3] = c * c * R[0, 0] - 2.0 * c * s * R[0, 1] + s * s * R[1, 1]
     mine[4] = c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1]
     mine[5] = s * s * R[0, 0] + 2.0 * c * s * R[0, 1] + c * c * R[1, 1]
-    if which == 0 and clock[0, D_COUNT] > 0 and now - max(clock[1, D_TIME], clock[1, D_BELIEVED]) > ALONE_NS:
+    if which == 0 and clock[0, D_COUNT] > 0 and _alone(core, now):
         if clock[0, D_TIME] - clock[0, D_SINCE] < LONG_NS <= now - clock[0, D_SINCE]:
             doubt_all(core.P)
+            core.slipped[:] = 0.0
         forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9)
     if clock[which, D_COUNT] == 0:
         clock[which, D_SINCE] = now
@@ -88,6 +107,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
                 give_way_upwards(core.P, z[2], climb)
             else:
                 give_way_turning(core.P, z[2])
+                core.slipped[:] = 0.0  # learned with a wrong yaw, it would hold on to it
             clock[which, D_COUNT] = 0
         return
     age = (now - clock[1 - which, D_TIME]) * 1e-9
@@ -104,11 +124,10 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     agree = distance <= AGREEING and sharp
     clock[0, D_AGREED] = max(clock[0, D_AGREED] + (1 if agree else -2), 0)
     if clock[0, D_AGREED] >= par.outvoted:
-        if now - clock[1, D_GAVE] <= AGAIN_NS:
-            start_again(core, par, now)
-        else:
-            give_way(core.P, doubt)
-        clock[1, D_GAVE] = now
+        give_way(core.P, doubt)
+        core.slipped[:] = 0.0
+        if gave_way(core.health, par.health.settled_ns, False, now):
+            core.health[H_OUTVOTED] = now
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
         clock[1, D_STREAK] = 0
 

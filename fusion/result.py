@@ -90,6 +90,8 @@ class Cause(IntEnum):
     """No position was explained by the state for long."""
     TILTED = 11
     """A land vehicle on its side: the IMU's axes are others."""
+    UNSETTLED = 12
+    """Degraded: it gave way to positions that contradicted it, of one sensor alone or again and again."""
 
 
 class Level(IntEnum):

@@ -117,6 +117,8 @@ def _health_limits(config: FusionConfig, *, land_vehicle: bool) -> HealthLimits:
         sigma_yaw_var=float(np.radians(model.max_sigma_yaw_deg) ** 2),
         lost_ns=round(model.lost_s * 1e9),
         lost=model.lost_count,
+        contradicted_ns=round(model.contradicted_s * 1e9),
+        settled_ns=round(model.settled_s * 1e9),
         max_speed2=model.max_speed**2 if land_vehicle else np.inf,
         least_upright=float(np.cos(np.radians(model.max_tilt_deg))) if land_vehicle else -np.inf,
         blown_var=model.blown_sigma_m**2,

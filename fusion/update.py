@@ -109,7 +109,7 @@ def _apply_position(
         tally(core, par, which, passed, now)
     if dof == 3:
         if passed:
-            believed(core, which, now)
+            believed(core, par, which, triple(rec.innovation, k), now)
         elif which:
             doubted(core, par, 1, triple(rec.innovation, k), heading(attitude(core.nav)), now)
         else:

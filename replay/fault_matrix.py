@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.config import FusionConfig
-from fusion.result import FusionResult, States
+from fusion.result import FusionResult, Health, States
 from fusion.run import Session, joined
 from replay.config import LIMITS, Limits
 from replay.plausibility import Watch
@@ -40,8 +40,14 @@ MOVING, MOVING_S = 5.0, 10.0
 """They begin when the vehicle will be faster than this for so long, m/s, s."""
 SIGMAS = 5.0
 """Errors beyond so many of the filter's sigmas are errors that it does not know of."""
+ALERT_S = 1.0
+"""So long such an error may last before the state's health tells of it, s."""
 NEVER_S = 1.0
 """An error that lasts until so short before the end of the drive was not recovered from, s."""
+
+
+WELL = (Health.HEALTHY, Health.RECOVERED)
+"""States that say nothing of an error."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +99,9 @@ class Outcome:
 
     ar: share of the epochs within the limits; peak_sigmas: largest error over sigma of any axis; recover_s: from the
     fault's end until the errors stay within the limits, or twice what they are without it (None: not in this drive);
-    astray: in some epoch an error was beyond a limit and beyond SIGMAS; warned: the run said that something is wrong;
-    not_finite: states; crash: the exception that ended the run.
+    astray: in some epoch an error was beyond a limit and beyond SIGMAS; untold_s: the longest that it was while the
+    state was said to be well; warned: kinds of the run's warnings; not_finite: states; crash: the exception that ended
+    the run.
     """
 
     ar: float = 0.0
@@ -103,6 +110,7 @@ class Outcome:
     peak_sigmas: float = np.inf
     recover_s: float | None = None
     astray: bool = True
+    untold_s: float = 0.0
     warned: tuple[str, ...] = ()
     not_finite: int = 0
     left_out: int = 0
@@ -110,8 +118,8 @@ class Outcome:
 
     @property
     def silent(self) -> bool:
-        """Whether it went astray and the run said nothing."""
-        return self.astray and not self.warned
+        """Whether it went astray and the states said that all is well for longer than ALERT_S."""
+        return self.untold_s > ALERT_S
 
     @property
     def broken(self) -> bool:
@@ -215,7 +223,7 @@ def judged(subject: Subject, result: FusionResult, warned: tuple[str, ...], inje
     within = (error <= subject.largest).all(axis=1)
     with np.errstate(invalid="ignore"):
         beyond = error / sigma > SIGMAS
-        astray = bool((~within & beyond.any(axis=1)).any())
+        lost = ~within & beyond.any(axis=1)
     fine = (error <= np.maximum(subject.largest, 2.0 * np.abs(subject.unharmed[since >= 0.0]))).all(axis=1)
     after = since[since >= 0.0] - injection.length_s
     return Outcome(
@@ -224,11 +232,26 @@ def judged(subject: Subject, result: FusionResult, warned: tuple[str, ...], inje
         peak_yaw_deg=_largest(error[:, 2]),
         peak_sigmas=_largest(error / sigma),
         recover_s=_recovery(after[(after > 0.0) & ~fine], float(after[-1])),
-        astray=astray or not finite.all(),
+        astray=bool(lost.any()) or not finite.all(),
+        untold_s=_longest(lost & well_at(subject, states)[since >= 0.0]) / subject.config.output_hz,
         warned=warned,
         not_finite=int((~finite).sum()),
         left_out=sum(entry.count for entry in result.left_out),
     )
+
+
+def well_at(subject: Subject, states: States) -> NDArray[np.bool_]:
+    """(N,) whether the state of each epoch of the drive is said to be healthy, or recovered."""
+    well = np.zeros(len(subject.epochs), bool)
+    rows = np.searchsorted(subject.epochs, states.t_ns)
+    well[rows[rows < len(well)]] = np.isin(states.health, WELL)[rows < len(well)]
+    return well
+
+
+def _longest(bad: NDArray[np.bool_]) -> int:
+    """So many in a row at most."""
+    edges = np.flatnonzero(np.diff(np.r_[False, bad, False]))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 def _recovery(bad_s: Floats, last_s: float) -> float | None:

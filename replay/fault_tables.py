@@ -7,7 +7,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from replay.bench.faults import Cell, Matrix
-from replay.fault_matrix import SENSOR_SETS, SIGMAS
+from replay.fault_matrix import ALERT_S, SENSOR_SETS, SIGMAS
 from replay.table import bare_table, number, percent
 from sensors.simulate.faults import FAULTS
 
@@ -79,7 +79,8 @@ def notes(found: Matrix) -> Iterator[str]:
     """What was done and what the words mean, one line each."""
     seeds = ", ".join(map(str, found.seeds))
     yield f"Scenario clean, {found.duration_s:g} s, seeds {seeds}: the worst drive, from the fault's begin to the end."
-    yield f"SILENT: beyond a limit and {SIGMAS:g} sigmas in some epoch, and no warning. astray: the same with one."
+    yield f"astray: beyond a limit and {SIGMAS:g} sigmas in some epoch; says so: no state was healthy then."
+    yield f"SILENT: it was said to be healthy, or recovered, for more than {ALERT_S:g} s meanwhile."
     yield "lost: not back within the limits, nor within twice the error without the fault, before the drive ends."
     yield "out, knows it: beyond a limit for a while, within its own sigmas."
     counts = {word: sum(verdict(cell) == word for cell in found.cells) for word in map(verdict, found.cells)}

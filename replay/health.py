@@ -31,7 +31,7 @@ class Tally:
 
     def __init__(self) -> None:
         self._pairs = np.zeros((len(Health), len(Cause)), np.int64)
-        self._diverged: dict[Cause, Stretches] = {}
+        self._told: dict[Cause, Stretches] = {}
         self._last = 0
         self.restarts: list[Restart] = []
 
@@ -42,12 +42,12 @@ class Tally:
         self._pairs += np.bincount(pairs, minlength=self._pairs.size).reshape(self._pairs.shape)
         self.restarts += result.restarts
         if len(states):
-            self._add_diverged(states)
+            self._add_told(states)
 
     @property
-    def diverged(self) -> Mapping[Cause, Stretches]:
-        """Stretches of divergence by cause, in the order of their first."""
-        return self._diverged
+    def told(self) -> Mapping[Cause, Stretches]:
+        """Stretches of divergence, and of a filter not settled, by cause, in the order of their first."""
+        return self._told
 
     def counts(self, epochs: int) -> dict[str, int]:
         """Epochs by state, those with a cause as "state/cause", and restarts; epochs: of the whole drive."""
@@ -59,16 +59,17 @@ class Tally:
                     counts[health.name.lower() + named] = int(self._pairs[health, cause])
         return counts | {RESTARTS: len(self.restarts)}
 
-    def _add_diverged(self, states: States) -> None:
+    def _add_told(self, states: States) -> None:
         """Stretches go on over the edge of a piece."""
-        codes = np.where(states.health == Health.DIVERGED, states.cause, 0)
+        counts = (states.health == Health.DIVERGED) | (states.cause == Cause.UNSETTLED)
+        codes = np.where(counts, states.cause, 0)
         first = np.flatnonzero(np.diff(codes, prepend=self._last))
         edges = np.unique(np.r_[0, first, len(codes)])
         for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             cause = Cause(int(codes[begin]))
             if cause is Cause.NONE:
                 continue
-            stretch = self._diverged.setdefault(cause, Stretches(start_ns=int(states.t_ns[begin])))
+            stretch = self._told.setdefault(cause, Stretches(start_ns=int(states.t_ns[begin])))
             stretch.epochs += end - begin
             stretch.count += int(begin in first)
             if stretch.count == 1:

@@ -40,6 +40,7 @@ DIVERGED = {
     Cause.TILTED: ("tilted", "it lies on its side (are the IMU's axes forward, left, up?)"),
 }
 """Kind and words for each cause of divergence."""
+UNSETTLED = ("unsettled", "it gave way to positions that contradicted it, of one sensor alone or again and again")
 
 
 class Watch:
@@ -65,7 +66,7 @@ class Watch:
         found = (
             *self._imu.findings(),
             ("never_aligned", self._never_aligned()),
-            *self._diverged(start_ns),
+            *self._told(start_ns),
             ("restarted", self._restarted(start_ns)),
             ("rejected", self._rejected()),
         )
@@ -81,13 +82,14 @@ class Watch:
         heading = "a heading (of a pose fix, two antennas or GNSS in motion)"
         return f"The filter never aligned, there is no output: it needs IMU, a position and {heading}."
 
-    def _diverged(self, start_ns: int) -> Iterator[tuple[str, str]]:
-        for cause, stretches in self.health.diverged.items():
-            kind, words = DIVERGED[cause]
+    def _told(self, start_ns: int) -> Iterator[tuple[str, str]]:
+        for cause, stretches in self.health.told.items():
+            kind, words = UNSETTLED if cause is Cause.UNSETTLED else DIVERGED[cause]
+            verb = "was not to be relied on" if cause is Cause.UNSETTLED else "diverged"
             start, end = ((t - start_ns) / NS_PER_S for t in (stretches.start_ns, stretches.end_ns))
             again = stretches.count - 1
             more = f", and {again} times more" if again > 1 else ", and once more" if again else ""
-            yield kind, f"The filter diverged from {start:.1f} to {end:.1f} s{more}: {words}."
+            yield kind, f"The filter {verb} from {start:.1f} to {end:.1f} s{more}: {words}."
 
     def _restarted(self, start_ns: int) -> str:
         restarts = self.health.restarts

@@ -67,6 +67,7 @@ def _figures(outcomes: list[Outcome]) -> dict[str, list[Any]]:
             "peak_error_over_sigma": [one.peak_sigmas for one in whole],
             "recover_s": [one.recover_s for one in whole],
             "astray": [float(one.astray) for one in whole],
+            "untold_s": [one.untold_s for one in whole],
             "warned": [float(bool(one.warned)) for one in whole],
             "silent": [float(one.silent) for one in whole],
         }

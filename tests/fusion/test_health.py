@@ -164,23 +164,23 @@ def nine_metres_off(log: Log) -> Log:
 
 
 CASES = {
-    "lever arm 30 m wrong": (lambda log: far_antenna(gnss_alone(log)), FusionConfig(), 0.2, 0.6),
-    "x and y swapped": (lambda log: swapped(gnss_alone(log), [1, 0, 2]), FusionConfig(), 0.3, 0.05),
-    "x and z swapped": (lambda log: swapped(log, [2, 1, 0]), FusionConfig(), 0.9, 0.0),
-    "x and z swapped, gnss alone": (lambda log: swapped(gnss_alone(log), [2, 1, 0]), FusionConfig(), 0.7, 0.0),
-    "in g": (in_g, FusionConfig(), 0.2, 0.0),
-    "in g, gnss alone": (lambda log: in_g(gnss_alone(log)), FusionConfig(), 0.3, 0.0),
-    "in degrees": (in_degrees, FusionConfig(), 0.3, 0.02),
-    "gates off, gnss 9 m off": (nine_metres_off, OPEN, 0.8, 0.0),
-    "gates off, gnss walks": (wandering, OPEN, 0.8, 0.0),
+    "lever arm 30 m wrong": (lambda log: far_antenna(gnss_alone(log)), FusionConfig(), 45.0),
+    "x and y swapped": (lambda log: swapped(gnss_alone(log), [1, 0, 2]), FusionConfig(), 6.0),
+    "x and z swapped": (lambda log: swapped(log, [2, 1, 0]), FusionConfig(), 0.5),
+    "x and z swapped, gnss alone": (lambda log: swapped(gnss_alone(log), [2, 1, 0]), FusionConfig(), 0.5),
+    "in g": (in_g, FusionConfig(), 20.0),
+    "in g, gnss alone": (lambda log: in_g(gnss_alone(log)), FusionConfig(), 6.0),
+    "in degrees": (in_degrees, FusionConfig(), 3.0),
+    "gates off, gnss 9 m off": (nine_metres_off, OPEN, 2.0),
+    "gates off, gnss walks": (wandering, OPEN, 2.0),
 }
-"""Log, config, least share of time diverged, most that is far off and said to be healthy."""
+"""Log, config, and so long after its first state, s, no state is said to be well any more, whatever brings it back."""
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_divergence_never_looks_like_success(drive: Drive, name: str) -> None:
-    """Shares of the time from the first state on. A lever arm shows in the first turn, not before."""
-    made, config, least, most = CASES[name]
+    """A lever arm shows in the first turn, not before: only there may a far state be said to be well."""
+    made, config, told_s = CASES[name]
     log = made(drive.log)
     result = run(log, config)
     diverged = result.states.health == Health.DIVERGED
@@ -188,9 +188,13 @@ def test_divergence_never_looks_like_success(drive: Drive, name: str) -> None:
     well = np.isin(result.states.health, (Health.HEALTHY, Health.RECOVERED))
     counts = Counter(Health(int(h)).name for h in result.states.health)
     causes = Counter(Cause(int(c)).name for c in result.states.cause[diverged])
+    s = seconds(log, result.states.t_ns)
+    last = s[well].max(initial=s[0]) - s[0]
     print(f"{name}: {dict(counts)}, {dict(causes)}, far {far.mean():.2f}, {len(result.restarts)} restarts")
-    assert diverged.mean() > least
-    assert (far & well).mean() <= most
+    print(f"well for the first {last:.1f} s")
+    assert diverged.any()
+    assert not well[s > s[0] + told_s].any()
+    assert (far & well).any() == (name == "lever arm 30 m wrong")
     assert (result.states.cause[diverged] >= Cause.NOT_FINITE).all()
 
 
@@ -225,13 +229,15 @@ def test_what_is_not_finite_is_diverged_and_begun_anew(drive: Drive) -> None:
     assert states.health[-1] == Health.HEALTHY
 
 
-def test_health_without_restart_stays_diverged(drive: Drive) -> None:
+def test_health_without_restart_is_never_well_again(drive: Drive) -> None:
+    """Votes bring it back again and again."""
     log = in_g(drive.log)
     result = run(log, FusionConfig(health=HealthModel(restart=False)))
     s, states = health(result, log)
     assert result.restarts == ()
-    assert (states[s > 30.0] == Health.DIVERGED).all()
-    assert (result.states.cause[s > 30.0] == Cause.TOO_FAST).all()
+    assert np.isin(states[s > 30.0], NOT_SUCCESS).all()
+    assert (states == Health.DIVERGED).any()
+    assert (result.states.cause[s > 30.0] == Cause.UNSETTLED).any()
 
 
 @pytest.mark.parametrize("made", [in_g, wandering, lambda log: with_outage(log, 40.0, 30.0)])
@@ -256,4 +262,4 @@ def test_health_does_not_depend_on_the_pieces(drive: Drive, made) -> None:  # ty
             for name in getattr(whole, part).__dataclass_fields__:
                 one, other = (getattr(getattr(result, part), name) for result in (whole, cut))
                 assert one.tobytes() == other.tobytes(), name
-    assert made is not in_g or len(whole.restarts) > 1
+    assert made is not in_g or len(whole.restarts) > 0

@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusion.config import FusionConfig, HealthModel
 from fusion.filter import Localizer
 from fusion.result import Cause, FusionResult, Health, Reason, Sensor, States
 from fusion.run import run
@@ -68,22 +67,20 @@ def test_back_after_a_long_outage(length_s: float, grade: str, wheel: bool) -> N
             assert (result.states.health[s > end_s + WITHIN_S[name] + 11.0] == Health.HEALTHY).all()
 
 
-def test_far_off_gnss_alone_takes_ten_seconds() -> None:
-    """And a second for levelling; longer where the vehicle then turns or stops, and its course is no yaw."""
+def test_far_off_gnss_alone_is_believed_within_seconds() -> None:
+    """After minutes without any and without the wheel: the state gives way, and does not pass for healthy meanwhile."""
     drive = drive_of("automotive", 300.0, 1)
     log = gnss_alone(with_outage(replace(drive.log, wheel=None), BEGIN_S, 300.0))
     result = run(log)
-    assert 10.0 <= back_after(log, result, drive, BEGIN_S + 300.0, (1.0, 3.0)) < 12.0
-    assert [restart.cause for restart in result.restarts] == [Cause.REJECTED]
-    used = result.decisions.t_ns[result.decisions.reason == Reason.USED_FOR_ALIGNMENT]
-    assert len(used) == 2
-    assert used[0] == result.aligned_ns
-    assert result.restarts[0].t_ns < used[1] < result.restarts[0].t_ns + 3e9
-    between = (result.decisions.t_ns > result.restarts[0].t_ns) & (result.decisions.t_ns < used[1])
-    assert (result.decisions.reason[between] == Reason.BEFORE_ALIGNMENT).all()
-    assert not ((result.states.t_ns > result.restarts[0].t_ns) & (result.states.t_ns < used[1])).any()
-    kept = run(log, FusionConfig(health=HealthModel(restart=False)))
-    assert np.hypot(*fused_errors(kept, drive)[-1, :2]) > 100.0  # without it never
+    back_s = BEGIN_S + 300.0
+    s, off = seconds(log, result.states.t_ns), np.hypot(*fused_errors(result, drive)[:, :2].T)
+    assert off[s < back_s][-1] > 5.0
+    took = back_after(log, result, drive, back_s, (1.0, 3.0))
+    assert 0.5 < took < 3.0
+    assert result.restarts == ()
+    health = result.states.health
+    assert np.isin(health[(s > back_s) & (s < back_s + took)], (Health.DEAD_RECKONING, Health.DEGRADED)).all()
+    assert (health[s > back_s + 45.0] == Health.HEALTHY).all()
 
 
 @pytest.fixture(scope="module")
@@ -184,14 +181,14 @@ def datum(log: Log) -> Log:
 
 @pytest.mark.parametrize("spoilt", [lambda log: log, datum], ids=["agreeing", "a datum apart"])
 def test_two_sensors_bring_a_far_state_back(drive: Drive, spoilt: Callable[[Log], Log]) -> None:
-    """A hundred metres: those that agree to centimetres outvote the state, those that do roughly begin it anew."""
+    """A hundred metres: also sensors that agree only roughly outvote the state, at once and without a gap."""
     log = spoilt(started_wrong(drive.log, 70.0))
     result = run(log)
     s, errors = seconds(log, result.states.t_ns), np.abs(fused_errors(result, drive))
     assert errors[s < 30.0, :2].max() > 50.0
-    within_s = 3.0 if spoilt is not datum else 13.0
-    assert (errors[s > 30.0 + within_s] < [1.0, 1.0, 1.0]).all()
-    assert len(result.restarts) == (1 if spoilt is datum else 0)
+    assert (errors[s > 33.0] < [1.0, 1.0, 1.0]).all()
+    assert (np.diff(s) < 0.15).all()
+    assert result.restarts == ()
 
 
 def test_starts_in_the_middle_of_a_drive(drive: Drive) -> None:
