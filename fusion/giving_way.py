@@ -28,11 +28,15 @@ UPWARDS_BIAS_VAR = 0.3**2
 
 
 @kernel()
-def forget(P: Floats, seconds: float) -> None:
-    """Widen position, velocity and attitude for the time that GNSS alone has contradicted them."""
+def forget(P: Floats, seconds: float, moving: bool) -> None:
+    """Widen position, velocity and attitude for the time that GNSS alone has contradicted them.
+
+    moving: else the yaw is left, since positions of a vehicle that stands say nothing of it.
+    """
     grown = 4.0 ** (seconds / ALONE_DOUBLING_S)
-    for i in range(9):
-        for j in range(9):
+    count = 9 if moving else 8
+    for i in range(count):
+        for j in range(count):
             P[i, j] *= grown
 
 

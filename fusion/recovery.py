@@ -93,7 +93,8 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
         if clock[0, D_TIME] - clock[0, D_SINCE] < LONG_NS <= now - clock[0, D_SINCE]:
             doubt_all(core.P)
             core.slipped[:] = 0.0
-        forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9)
+        moving = math.hypot(core.nav[3], core.nav[4]) >= COURSE_SPEED
+        forget(core.P, min(now - clock[0, D_TIME], ALONE_NS) * 1e-9, moving)
     if clock[which, D_COUNT] == 0:
         clock[which, D_SINCE] = now
     clock[which, D_COUNT] += 1
