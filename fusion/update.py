@@ -10,7 +10,7 @@ from fusion.covariance import propagate
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
 from fusion.gating import correct, innovate, whiten
 from fusion.health import SOURCES, hopeless, judge, level_of, noted, questionable
-from fusion.measurements import heading
+from fusion.measurements import Pair, heading
 from fusion.motion import motion
 from fusion.observing import measure, triple
 from fusion.recovery import believed, doubted, in_doubt
@@ -43,9 +43,12 @@ def gives_up(core: Core, par: Parameters, ev: Events, e: int, now: int) -> bool:
     )
 
 
-@kernel(inline="always")
+@kernel()
 def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Events, e: int, rate: Vector) -> None:
-    """Apply or record event e at the state's time; rate: bias-free body rate, rad/s."""
+    """Apply or record event e at the state's time; rate: bias-free body rate, rad/s.
+
+    Compiled for itself: both orders share it, and what it calls is large.
+    """
     kind = ev.kind[e]
     if ev.verdict[e] >= 0:
         record_decision(rec, e, kind, 0, ev.verdict[e])
@@ -72,49 +75,31 @@ def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Even
             record_decision(rec, e, kind, 0, accepted)
             return
     k = record_decision(rec, e, kind, dof, _CHI_SQUARE)
+    threshold = threshold_of(core, par, dof, ev.t[e]) if kind == _POSE_FIX else par.gate[dof - 1]
+    passed = _apply(core, rec, par, k, dof, threshold, accepted)
     if kind in (_GNSS_POSITION, _POSE_FIX):
-        passed, dof = _apply_position(core, rec, par, m, ev, e, rate, k, (dof, accepted))
-    else:
-        passed = _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
+        first = par.layout.pose_error if kind == _POSE_FIX else par.layout.gnss_error
+        if not passed and first >= 0:
+            passed, dof, accepted = _apply_renewed(core, rec, par, m, ev, e, rate, k, (threshold, first))
+        if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
+            tally(core, par, int(kind == _POSE_FIX), passed, ev.t[e])
+        if dof == 3:
+            _weigh(core, rec, par, int(kind == _POSE_FIX), passed, k, ev.t[e])
     if kind < _SOURCES:
         explained = passed and rec.scores[k, 0] <= par.health.explained[dof - 1]
         noted(core.health, core.trust, par.health.suspect, kind, passed, explained, ev.t[e])
 
 
 @kernel(inline="always")
-def _apply_position(
-    core: Core,
-    rec: Recorder,
-    par: Parameters,
-    m: Measurements,
-    ev: Events,
-    e: int,
-    rate: Vector,
-    k: int,
-    found: tuple[int, int],
-) -> tuple[bool, int]:
-    """Apply the position (GNSS, pose fix) of event e that is in the core; what its fate says of the state.
-
-    found: what ``measure`` gave. Returns whether it passed, and its degrees of freedom.
-    """
-    dof, accepted = found
-    kind, now = ev.kind[e], ev.t[e]
-    which = int(kind == _POSE_FIX)
-    threshold = threshold_of(core, par, dof, now) if which else par.gate[dof - 1]
-    passed = _apply(core, rec, par, k, dof, threshold, accepted)
-    first = par.layout.pose_error if which else par.layout.gnss_error
-    if not passed and first >= 0:
-        passed, dof, accepted = _apply_renewed(core, rec, par, m, ev, e, rate, k, (threshold, first))
-    if not (passed and accepted == _MODES_AGREE):  # which says nothing of where the modes differ
-        tally(core, par, which, passed, now)
-    if dof == 3:
-        if passed:
-            believed(core, par, which, triple(rec.innovation, k), now)
-        elif which:
-            doubted(core, par, 1, triple(rec.innovation, k), heading(attitude(core.nav)), now)
-        else:
-            doubted(core, par, 0, triple(rec.innovation, k), (1.0, 0.0), now)
-    return passed, dof
+def _weigh(core: Core, rec: Recorder, par: Parameters, which: int, passed: bool, k: int, now: int) -> None:
+    """What the fate of a whole position of sensor which (0 GNSS, 1 pose fix), decision k, says of the state."""
+    if passed:
+        believed(core, par, which, triple(rec.innovation, k), now)
+        return
+    ahead: Pair = (1.0, 0.0)
+    if which:
+        ahead = heading(attitude(core.nav))
+    doubted(core, par, which, triple(rec.innovation, k), ahead, now)
 
 
 @kernel()
@@ -136,13 +121,17 @@ def _apply_renewed(
     position passed.
     """
     threshold, first = judged
-    kind, row, passed = ev.kind[e], ev.row[e], False
-    dof, accepted = measure(core, par, m, kind, row, rate, False)
-    known = may_renew(core, int(kind == _POSE_FIX)) and innovate(core.P, core.H, core.W, dof, core.R, core.L)
-    if known and whiten(dof, core.residual, core.L) <= threshold:
+    kind, passed = ev.kind[e], False
+    dof, accepted = 0, 0
+    for lasts in (False, True):
+        dof, accepted = measure(core, par, m, kind, ev.row[e], rate, lasts)
+        if lasts:
+            passed = _apply(core, rec, par, k, dof, threshold, accepted)
+            break
+        known = may_renew(core, int(kind == _POSE_FIX)) and innovate(core.P, core.H, core.W, dof, core.R, core.L)
+        if not (known and whiten(dof, core.residual, core.L) <= threshold):
+            break
         renew(core, first)
-        dof, accepted = measure(core, par, m, kind, row, rate, True)
-        passed = _apply(core, rec, par, k, dof, threshold, accepted)
     return passed, dof, accepted
 
 
