@@ -181,9 +181,7 @@ def test_what_the_scale_of_an_accelerometer_is_worth() -> None:
                 ends[k, with_wheel, is_off] = np.linalg.norm(enu_from_llh(states.llh[at : at + 1], truth.llh[0])[0, :2])
     (without, without_off), (wheel, wheel_off) = np.median(ends, axis=0)
     print(f"six minutes show the scale to {1e6 * np.median(sigmas):.0f} ppm")
-    print(
-        f"after 60 s {without:.2f} m, scale off {without_off:.2f} m; with wheel {wheel:.2f}, {wheel_off:.2f} m"
-    )
+    print(f"after 60 s {without:.2f} m, scale off {without_off:.2f} m; with wheel {wheel:.2f}, {wheel_off:.2f} m")
     assert np.median(sigmas) < off / 3.0
     assert without_off < 1.5 * without
     assert wheel_off < 1.5 * wheel
