@@ -13,6 +13,9 @@ from fusion.state import Core, Floats
 from fusion.tape import note_fade
 from sensors.kernel import kernel
 
+SHAKEN = 1.5
+"""An acceleration differs by so much, each axis, from what it was or will be after a delay, m/s^2."""
+
 
 @kernel(fastmath={"contract"})
 def fade(core: Core, first: int, keep: float) -> None:
@@ -113,12 +116,13 @@ def see_delay(nav: Floats, H: Floats, residual: Floats, k: int, change: Vector, 
 
 @kernel()
 def allow_delay(core: Core, k: int, change: Vector) -> None:
-    """The same where the change is known badly: it corrects the residual and widens R, and shows nothing of the delay.
+    """A velocity that is older than thought by the delay state k, change (3,): the acceleration, m/s^2.
 
-    An acceleration is shaken by engine and road. What is regressed on noise comes out too small, and sure of itself.
+    It corrects the residual and widens R, and shows nothing of the delay: engine and road shake the acceleration, and
+    what is regressed on noise comes out too small, and sure of itself (as the correlation with the velocity would).
     """
-    nav, R, variance = core.nav, core.R, core.P[k, k]
+    delay = core.nav[k + 1]
+    variance = SHAKEN * SHAKEN * (core.P[k, k] + delay * delay)
     for i in range(3):
-        core.residual[i] += change[i] * nav[k + 1]
-        for j in range(3):
-            R[i, j] += change[i] * change[j] * variance
+        core.residual[i] += change[i] * delay
+        core.R[i, i] += variance

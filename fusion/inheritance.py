@@ -11,8 +11,11 @@ import numpy as np
 
 from fusion.baselines import Fix
 from fusion.events import Parameters
-from fusion.state import E_POSITION, QUATERNION, VELOCITY, Floats
+from fusion.state import E_POSITION, E_VELOCITY, QUATERNION, VELOCITY, Floats
 from sensors.rotation import matrix_from_q
+
+UNKNOWN_ACCELERATION = 1.5
+"""By so much that of the first state may differ from its mean before, each axis, m/s^2."""
 
 
 def inherit_gnss(P: Floats, fix: Fix, nav: Floats, rate: Floats, acceleration: Floats, par: Parameters) -> None:
@@ -22,6 +25,10 @@ def inherit_gnss(P: Floats, fix: Fix, nav: Floats, rate: Floats, acceleration: F
     R = matrix_from_q(nav[QUATERNION])
     _carry(P, slice(0, 6), par.layout.gnss_arm, -np.vstack((R, R @ np.cross(rate, np.eye(3)).T)))
     _carry(P, slice(0, 6), par.layout.gnss_delay, np.concatenate((nav[VELOCITY], acceleration))[:, None])
+    if par.layout.gnss_delay >= 0:
+        P[E_VELOCITY, E_VELOCITY] += (
+            P[par.layout.gnss_delay, par.layout.gnss_delay] * UNKNOWN_ACCELERATION**2 * np.eye(3)
+        )
     if first < 0:
         return
     P[E_POSITION, E_POSITION] += (white + lasts - 1.0) * fix.cov

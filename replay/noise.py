@@ -148,12 +148,15 @@ def facts(noise: RunNoise) -> dict[str, Any]:
 
 
 def config_lines(found: NoiseEstimate) -> str:
-    """The lines to paste into a config: what the drive does not tell is left out, and share and time go together."""
+    """The lines to paste into a config: what the drive does not tell is left out.
+
+    Share and time go with the inflation: they divide the same variance, and others would make another of it.
+    """
     sections: dict[str, list[str]] = {}
-    silent = {name.partition(".")[0] for name, each in found.found.items() if not (each.observed or each.at_bound)}
     for name, each in found.found.items():
         section, field = name.split(".")
-        if section not in silent or (each.observed and not field.startswith("lasting")):
+        telling = found.found[f"{section}.inflation"] if field.startswith("lasting") else each
+        if telling.observed or telling.at_bound:
             lines = sections.setdefault(section, [])
             lines.append(f"{field} = {float(f'{each.value:.3g}')!r}")
             if field == "lasting_share":

@@ -80,7 +80,7 @@ def test_health_of_a_covariance() -> None:
 
 def test_its_json_and_its_table(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     run = bench.run
-    monkeypatch.setattr(bench, "run", lambda **options: run(hours=0.1, **options))
+    monkeypatch.setattr(bench, "run", lambda seeds, **options: run(seeds, hours=0.1, **options))
     short = [bench.Case(c.name, c.scenario, 20.0, c.config) for c in bench.cases()]
     monkeypatch.setattr(bench, "cases", lambda: tuple(short))
     assert main(["bench", "consistency", "--seeds", "2", "--json"]) == 0

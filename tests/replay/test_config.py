@@ -35,7 +35,7 @@ def test_a_written_config_is_complete() -> None:
     text = to_toml(RunConfig())
     for name in msgspec.structs.asdict(FusionConfig()):
         assert name in text
-    assert "white_share = 0.7" in text
+    assert "lasting_share = 0.7" in text
 
 
 @given(st.dictionaries(st.text(max_size=8), st.text(max_size=8), max_size=3))

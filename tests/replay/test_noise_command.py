@@ -98,7 +98,12 @@ def test_its_log_is_filtered_for_the_noise_that_makes_it_likely(
     assert then["gnss_position", "horizontal"]["count"] < 410
     (tmp_path / "found.toml").write_text(found["config_toml"])
     config = load_config(tmp_path / "found.toml")
-    assert config.fusion.gnss.inflation == pytest.approx(found["estimate"]["gnss.inflation"]["value"], rel=0.01)
+    velocity, pose = found["estimate"]["gnss.velocity_inflation"], config.fusion.pose
+    assert config.fusion.gnss.velocity_inflation == pytest.approx(velocity["value"], rel=0.01)
+    assert pose.inflation == pytest.approx(found["estimate"]["pose.inflation"]["value"], rel=0.01)
+    assert pose.white_share + pose.lasting_share == pytest.approx(1.0)  # what is found is one variance, divided
+    assert not found["estimate"]["gnss.inflation"]["observed"]  # forty seconds are too short for that
+    assert config.fusion.gnss.inflation == 1.0
     assert main(["noise", str(made / "run"), "--duration-s", "40"]) == 0
     printed = capsys.readouterr().out
     assert "Most likely noise" in printed

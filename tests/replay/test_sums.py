@@ -50,6 +50,7 @@ def test_a_campaign_of_one_log_has_its_figures() -> None:
     assert campaign.pop("warnings") == named
     assert campaign.pop("logs") == {"total": 1, "done": 1, "failed": []}
     assert campaign.pop("warning_counts") == {"lost": 1}
+    assert one.pop("estimates") == []  # of a drive, not of many
     assert campaign == one
 
 
