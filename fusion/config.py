@@ -36,7 +36,7 @@ LONGEST_HISTORY_S = 10.0
 class ImuNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How the datasheet figures become process noise."""
 
-    noise_scale: NonNegative = 2.0
+    noise_scale: NonNegative = 1.5
     """White noise of gyro and accelerometer, times the datasheet's (vibration, quantization), -."""
     temperature_walk_k: NonNegative = 0.2
     """How the IMU's temperature changes, which moves its biases: random walk, K/sqrt(s)."""
