@@ -80,18 +80,18 @@ class Cause(IntEnum):
     WHEEL = 5
     SIGMA = 6
     """Position or yaw is known badly."""
-    NOT_FINITE = 7
+    UNSETTLED = 7
+    """It gave way to positions that contradicted it, of one sensor alone or again and again."""
+    NOT_FINITE = 8
     """The state is not finite, or a variance not a number above zero."""
-    TOO_FAST = 8
+    TOO_FAST = 9
     """Faster than any land vehicle."""
-    COVARIANCE = 9
+    COVARIANCE = 10
     """Position or yaw is not known at all."""
-    REJECTED = 10
+    REJECTED = 11
     """No position was explained by the state for long."""
-    TILTED = 11
+    TILTED = 12
     """A land vehicle on its side: the IMU's axes are others."""
-    UNSETTLED = 12
-    """Degraded: it gave way to positions that contradicted it, of one sensor alone or again and again."""
 
 
 class Level(IntEnum):

@@ -1,6 +1,6 @@
 """The short form of the fault matrix: no crash, no state that is not finite, no silent divergence, and back in time.
 
-What today's filter fails is marked, with the reason; the whole matrix stands in docs/fault-matrix.md.
+What today's filter does not tell is marked, with the reason; the whole matrix stands in docs/fault-matrix.md.
 """
 
 import json
@@ -19,18 +19,11 @@ from sensors.simulate.faults.spec import parse
 from sensors.simulate.gnss import displaced
 
 SEED = 1000
-RECOVERS_S = 20.0
-"""After the fault's end, s."""
 ALL, NO_POSE = SENSOR_SETS
-ALONE = "led astray, and then GNSS alone says where the vehicle is: one sensor outvotes nothing, so it stays lost"
-FAILS = {
-    (name, NO_POSE): ALONE
-    for name in (
-        *("gnss-drift", "imu-saturation", "imu-gyro-bias", "imu-accel-bias"),
-        *("imu-axis-flip", "imu-scale", "imu-noise", "imu-time-jump"),
-    )
-}
-"""Fault and set of sensors -> why it is not recovered from. All of them say that they are lost."""
+RECOVERS_S = {ALL: 20.0, NO_POSE: 40.0}
+"""After the fault's end, s. GNSS alone shows a yaw that is a degree off only where the vehicle turns or speeds up."""
+SILENT = {("gnss-drift", NO_POSE): "a lone receiver that drifts by 0.1 m/s is followed: nothing says that it is wrong"}
+"""Fault and set of sensors -> why the states are said to be healthy."""
 
 
 @pytest.fixture(scope="module")
@@ -38,32 +31,33 @@ def drives() -> dict[str, Subject]:
     return {subject.sensors: subject for subject in subjects(1, SEED, SHORT_S)}
 
 
-CASES = [
-    pytest.param(
-        name,
-        sensors,
-        id=f"{name}, {sensors}",
-        marks=[pytest.mark.xfail(strict=True, reason=FAILS[name, sensors])] if (name, sensors) in FAILS else [],
-    )
-    for name, fault in FAULTS.items()
-    for sensors in SENSOR_SETS
-    if acts_on(fault, sensors)
-]
+CASES = [(name, sensors) for name, fault in FAULTS.items() for sensors in SENSOR_SETS if acts_on(fault, sensors)]
 
 
 @pytest.mark.parametrize(("name", "sensors"), CASES)
 def test_a_fault_is_survived(name: str, sensors: str, drives: dict[str, Subject]) -> None:
     found = medium(drives[sensors], name)
     assert found.recover_s is not None
-    assert found.recover_s <= RECOVERS_S
+    assert found.recover_s <= RECOVERS_S[sensors]
 
 
-@pytest.mark.parametrize(("name", "sensors"), [case.values for case in CASES])
-def test_a_fault_breaks_nothing_and_is_never_silent(name: str, sensors: str, drives: dict[str, Subject]) -> None:
+@pytest.mark.parametrize(
+    ("name", "sensors"),
+    [
+        pytest.param(*case, marks=pytest.mark.xfail(strict=True, reason=SILENT[case])) if case in SILENT else case
+        for case in CASES
+    ],
+)
+def test_a_fault_is_never_silent(name: str, sensors: str, drives: dict[str, Subject]) -> None:
+    found = medium(drives[sensors], name)
+    assert not found.silent
+
+
+@pytest.mark.parametrize(("name", "sensors"), CASES)
+def test_a_fault_breaks_nothing(name: str, sensors: str, drives: dict[str, Subject]) -> None:
     found = medium(drives[sensors], name)
     assert not found.crash
     assert found.not_finite == 0
-    assert not found.silent
 
 
 def medium(subject: Subject, name: str) -> Outcome:
@@ -137,7 +131,8 @@ GOOD = Outcome(1.0, 0.02, 0.03, 2.0, 0.0, False)
         (replace(GOOD, ar=0.99), "out, knows it"),
         (replace(GOOD, ar=0.9, astray=True, warned=("lost",)), "astray, says so"),
         (replace(GOOD, ar=0.1, recover_s=None, astray=True, warned=("lost",)), "lost, says so"),
-        (replace(GOOD, ar=0.9, astray=True), "SILENT"),
+        (replace(GOOD, ar=0.9, astray=True, untold_s=1.0), "astray, says so"),
+        (replace(GOOD, ar=0.9, astray=True, untold_s=1.1), "SILENT"),
         (replace(GOOD, not_finite=3), "NOT FINITE"),
         (Outcome(crash="ValueError: no"), "CRASH"),
     ],
