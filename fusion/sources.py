@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fusion.config import FusionConfig
 from fusion.events import Measurements
-from fusion.linearized import linearize
+from fusion.linearized import linearize, raise_to, turn_into_enu
 from fusion.modes import spread_of
 from fusion.result import Reason, Sensor
 from fusion.state import Floats
@@ -167,7 +167,7 @@ def _gnss(fixes: GnssFix, vehicle: Vehicle, config: FusionConfig, first_row: int
     verdict = np.where(low & (verdict == APPLY), np.int8(Reason.STATUS), verdict)
     floors = np.array([model.sigma_floor_horizontal_m] * 2 + [model.sigma_floor_vertical_m]) ** 2
     arm_var = 0.0 if config.estimate.lever_arm else vehicle.gnss_lever_arm_sigma_m**2
-    cov = _floor(fixes.cov_enu * model.inflation, floors) + np.eye(3) * arm_var
+    cov = _floor(fixes.cov_enu, model.inflation, floors, arm_var)
     place = {"gnss_llh": fixes.llh, "gnss_cov": cov}
     positions = _of(Sensor.GNSS_POSITION, fixes, vehicle.gnss_delay_s, place, verdict, first_row)
     known = np.flatnonzero(np.isfinite(fixes.yaw) & np.isfinite(fixes.yaw_sigma))
@@ -179,7 +179,7 @@ def _gnss(fixes: GnssFix, vehicle: Vehicle, config: FusionConfig, first_row: int
 
 def _velocity(velocity: GnssVelocity, vehicle: Vehicle, config: FusionConfig, first_row: int) -> Sources:
     model = config.gnss
-    cov = _floor(velocity.cov_enu * model.velocity_inflation, np.full(3, model.sigma_floor_velocity**2))
+    cov = _floor(velocity.cov_enu, model.velocity_inflation, np.full(3, model.sigma_floor_velocity**2))
     columns = {"vel": velocity.vel_enu, "vel_cov": cov}
     verdict = _switch(model.use and model.use_velocity, len(velocity))
     return _of(Sensor.GNSS_VELOCITY, velocity, vehicle.gnss_velocity_delay_s, columns, verdict, first_row)
@@ -217,19 +217,10 @@ _NOTHING = Sources(
 )
 
 
-def _floor(cov: Floats, variances: Floats) -> Floats:
-    """Raise every direction of the plane, and the third axis, to at least these variances (3,), the first two equal.
-
-    A diagonal alone does not show the plane's smallest variance: a street that runs north-east hides it. What is added
-    is positive semidefinite, and keeps a matrix positive definite.
-    """
-    raised = cov.copy()
-    half = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1])
-    smallest = half - np.hypot(0.5 * (cov[:, 0, 0] - cov[:, 1, 1]), cov[:, 0, 1])
-    missing = np.where(smallest < variances[0], variances[0] - smallest, 0.0)
-    raised[:, 0, 0] += missing
-    raised[:, 1, 1] += missing
-    raised[:, 2, 2] = np.maximum(raised[:, 2, 2], variances[2])
+def _floor(cov: Floats, factor: float, floors: Floats, added: float = 0.0) -> Floats:
+    """``raise_to`` in a new array."""
+    raised = np.empty(cov.shape)
+    raise_to(cov, factor, floors, added, raised)
     return raised
 
 
@@ -250,10 +241,11 @@ def pose_columns(
     transform, tilt, yaw = np.empty((n, 3, 3)), np.empty((n, 2)), np.empty(n)
     linearize(rotation, scale, np.ascontiguousarray(fixes.pose[:, 2]), transform, tilt, yaw)
     floors = np.array([model.sigma_floor_m, model.sigma_floor_m, np.radians(model.sigma_floor_yaw_deg)]) ** 2
-    quantization = np.diag([model.step_m, model.step_m, np.radians(model.step_deg)]) ** 2 / 12.0
-    stated = (fixes.cov + quantization) * model.inflation
-    cov = _floor(transform @ stated @ transform.transpose(0, 2, 1), floors)
-    spread = np.einsum("nij,nj->ni", transform, spread_of(fixes)) if model.modes else np.zeros((n, 3))
+    quantization = np.array([model.step_m, model.step_m, np.radians(model.step_deg)]) ** 2 / 12.0
+    turned, spread = np.empty((n, 3, 3)), np.empty((n, 3))
+    modes = spread_of(fixes) if model.modes else np.zeros((n, 3))
+    turn_into_enu(transform, fixes.cov, quantization, modes, turned, spread)
+    cov = _floor(turned, model.inflation, floors)
     if spread.any():
         cov += spread[:, :, None] * spread[:, None, :]
     return llh, yaw, tilt, cov, spread
