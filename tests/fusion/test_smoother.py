@@ -23,12 +23,13 @@ from sensors.simulate.drive import simulate, simulate_drive
 from sensors.simulate.trajectory import Truth
 from tests.fusion.dense_rts import Watch, rts
 from tests.fusion.free import HONEST_FREE
-from tests.fusion.scenes import later, only, seconds, with_gap, with_outage
+from tests.fusion.scenes import later, only, seconds, with_gap, with_outage, without
 from tests.fusion.test_consistency import pose_and_velocity_nees
 from tests.fusion.test_session import assert_same, cuts_of, pieces
 
 Floats = NDArray[np.float64]
 
+GNSS, BEGINS = ("gnss", "gnss_velocity"), (50.0, 100.0, 150.0, 200.0)
 TOLERANCE = 1e-6
 """In smoothed sigmas: the oracle inverts covariances."""
 
@@ -177,6 +178,24 @@ def test_consistent_and_better_than_the_filter_through_outages() -> None:
     mean = np.mean(scores, axis=0)
     print(f"NEES per degree of freedom: pose {mean[0]:.3f}, velocity {mean[1]:.3f}")
     assert mean == pytest.approx([1.0, 1.0], abs=0.25)
+
+
+@pytest.mark.parametrize("grade", ["tactical", "automotive", "consumer"])
+def test_better_than_the_filter_in_every_hidden_stretch(grade: str) -> None:
+    """GNSS and IMU alone, half a minute hidden of every fifty seconds, against the truth; the vehicle also stands."""
+    scene = scenarios.load("clean")
+    scene = msgspec.structs.replace(scene, imu=msgspec.structs.replace(scene.imu, preset=grade))
+    for seed in (100_004, 100_005):
+        drive = simulate_drive(240.0, seed, scene)
+        log = replace(drive.log, pose_fixes=None, wheel=None)
+        for begin in BEGINS:
+            log = replace(log, **{n: without(getattr(log, n), log, begin, begin + 30.0) for n in GNSS})
+        result, states = smooth(log)
+        s = seconds(log, states.t_ns)
+        for begin in BEGINS:
+            rows = (s > begin) & (s < begin + 30.0)
+            before, after = (worst(of, drive.truth, rows) for of in (result.states, states))
+            assert after < before, (seed, begin)
 
 
 def test_a_minute_without_imu(log: Log) -> None:
