@@ -19,6 +19,7 @@ from fusion.state import (
     H_SINCE,
     H_START,
     H_STATE,
+    H_TIMES,
     H_UNSETTLED,
     H_WIDE,
     T_DOUBT,
@@ -41,15 +42,24 @@ _ABSENT, _STALE, _SUSPECT, _GOOD = (int(level) for level in Level)
 _GNSS, _YAW, _POSE = int(Sensor.GNSS_POSITION), int(Sensor.GNSS_YAW), int(Sensor.POSE_FIX)
 _COUNT = len(SOURCES)
 
+LONGEST = 4
+"""A state is unsettled for at most so many times ``health.settled_s``."""
 
-def begin(core: Core, now: int, before: Core | None) -> None:
-    """Set the clocks of a core that was aligned at now; before: the core that diverged, None: the first start."""
+
+def begin(core: Core, now: int, before: Core | None, settled: int) -> None:
+    """Set the clocks of a core that was aligned at now; before: the core that diverged, None: the first start.
+
+    settled: so long a start after the second is not taken to be well, ns.
+    """
     clock = core.health
     clock[H_START] = clock[H_FED] = clock[H_HELD] = now
     clock[H_STATE] = _HEALTHY
     if before is not None:
         clock[H_BACK], clock[H_RESTARTS] = now, before.health[H_RESTARTS] + 1
-        clock[H_GAVE], clock[H_UNSETTLED] = before.health[H_GAVE], before.health[H_UNSETTLED]
+        for kept in (H_GAVE, H_UNSETTLED, H_TIMES):
+            clock[kept] = before.health[kept]
+        if clock[H_RESTARTS] > 1:
+            unsettle(clock, settled, now)
         core.trust[:, T_SEEN], core.trust[:, T_GOOD] = before.trust[:, T_SEEN], before.trust[:, T_GOOD]
         core.quietest[:] = before.quietest
 
@@ -82,14 +92,22 @@ def noted(
 
 
 @kernel()
+def unsettle(clock: Nanoseconds, settled: int, now: int) -> None:
+    """The state may be wrong again soon: for longer each time, since what is wrong may be the IMU."""
+    clock[H_UNSETTLED] = now + min(max(clock[H_TIMES], clock[H_RESTARTS]) - 1, LONGEST - 1) * settled
+
+
+@kernel()
 def gave_way(clock: Nanoseconds, settled: int, alone: bool, now: int) -> bool:
     """The state gave way to positions that contradicted it; whether it had done so shortly before.
 
     clock: Core.health; settled: what is shortly, ns; alone: to those of one sensor, which may have been wrong.
     """
     again: bool = now - clock[H_GAVE] <= settled
-    if alone or again:
-        clock[H_UNSETTLED] = now
+    if not again:
+        clock[H_TIMES] += 1
+    if alone or again or clock[H_TIMES] > 1:
+        unsettle(clock, settled, now)
     clock[H_GAVE] = clock[H_BACK] = now
     return again
 

@@ -167,7 +167,7 @@ class Navigator:
             self._decisions.append(unused(early, Reason.BEFORE_ALIGNMENT, initial))
         if initial is not None:
             self.core = start(initial, imu)
-            begin(self.core, initial.t_ns, self._diverged)
+            begin(self.core, initial.t_ns, self._diverged, self._par.health.settled_ns)
             self.aligned_ns = initial.t_ns if self.aligned_ns is None else self.aligned_ns
         return self.core
 

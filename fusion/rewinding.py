@@ -216,7 +216,7 @@ class RewindingNavigator(Navigator):
         """Begin with a first state; silent_ns: states up to this time were not known when the clock read it."""
         length_s = self._config.history_s
         core = start(initial, imu)
-        begin(core, initial.t_ns, self._diverged)
+        begin(core, initial.t_ns, self._diverged, self._par.health.settled_ns)
         self.core = with_snapshots(core, length_s)
         self.aligned_ns = initial.t_ns if self.aligned_ns is None else self.aligned_ns
         self._columns = columns_for(self._nothing.measurements, length_s)

@@ -67,7 +67,7 @@ D_COUNT, D_TIME, D_AGREED, D_BELIEVED, D_SINCE, D_STREAK, D_LAST, D_TRACKING, D_
 # entries of Core.health: Health and Cause; when the core was aligned, a position was applied, one was explained, the
 # filter came back, the yaw was last known worse than linear; positions not explained since, the first and the last of
 # them; how often it was aligned anew; when the state gave way last, was outvoted again, gave way to one sensor
-# alone or again
+# alone or again, and how many such times there were
 (
     H_STATE,
     H_CAUSE,
@@ -83,7 +83,8 @@ D_COUNT, D_TIME, D_AGREED, D_BELIEVED, D_SINCE, D_STREAK, D_LAST, D_TRACKING, D_
     H_GAVE,
     H_OUTVOTED,
     H_UNSETTLED,
-) = range(14)
+    H_TIMES,
+) = range(15)
 
 # columns of Core.trust: when a measurement was last judged, last explained; how many more were not than were
 T_SEEN, T_GOOD, T_DOUBT = range(3)
@@ -110,7 +111,7 @@ class Core(NamedTuple):
     horizontal variance that the last GNSS position stated.
     doubt (2, 13), doubt_clock (2, 9) int64: the last rejected GNSS position and pose fix (``fusion.recovery``,
     ``fusion.streak``); fresh (5,): the pose fix that is being judged: innovation east, north m and its R's ee, en, nn.
-    health (14,), trust (5, 3) int64: clocks of ``fusion.health`` (H_*, T_*).
+    health (15,), trust (5, 3) int64: clocks of ``fusion.health`` (H_*, T_*).
     phi (9, 16), M (9, n), Mt (16, 16), H, W (3, n), R, L (3, 3),
     eigen (2, 3, 3), residual (3,), dx (n,): scratch.
     turned (3, 3): A_T of the last transition; tape (K,), tape_end (1,): what ``fusion.tape`` puts down; K = 0: nothing.
@@ -174,7 +175,7 @@ def new_core(size: int = ERROR_SIZE) -> Core:
         doubt=np.zeros((2, 13)),
         doubt_clock=np.zeros((2, 9), np.int64),
         fresh=np.zeros(5),
-        health=np.array([0, 0, *(NEVER,) * 5, 0, NEVER, NEVER, 0, *(NEVER,) * 3], np.int64),
+        health=np.array([0, 0, *(NEVER,) * 5, 0, NEVER, NEVER, 0, *(NEVER,) * 3, 0], np.int64),
         trust=np.tile(np.array([NEVER, NEVER, 0], np.int64), (5, 1)),
         phi=np.zeros((9, ROW)),
         M=np.zeros((9, size)),

@@ -21,7 +21,7 @@ TRACKING_NS = 2_000_000_000
 """The filter was tracking if a position was applied within so long before the streak."""
 ALIAS_M = 1.5
 """Nothing that looks alike on a road lies nearer: half of a narrow lane, or of the shortest pitch of dashes."""
-INSISTING = 5
+INSISTING = 2
 """So many GNSS positions rejected in a row before one may be explained by a new error that lasts."""
 SAME = 9.21
 """Largest squared distance, in variances, of a fix that goes on as the one before it: 99 % of two dimensions. The

@@ -36,7 +36,7 @@ class Step(NamedTuple):
 WIDENED = ("forget", "doubt_all", "give_way", "give_way_turning", "give_way_upwards")
 PLAIN = {
     fusion._kernels: ("sweep", "handle", "_coast"),
-    fusion.update: ("_apply", "_apply_position", "_apply_renewed", "measure", "motion", "doubted"),
+    fusion.update: ("_apply", "_weigh", "_apply_renewed", "measure", "motion", "doubted"),
     fusion.observing: ("_measure_pose", "_see_matching", "_see_receiver"),
     fusion.motion: ("_zero_rate",),
 }

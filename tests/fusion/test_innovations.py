@@ -31,6 +31,7 @@ def decided(innovation: Floats, sensor: Sensor, sigma: float = 2.0, reason: Reas
         codes,
         zero,
         zero,
+        zero + 1.0,
     )
 
 
