@@ -21,11 +21,12 @@ def kitti() -> Log:
     return load("gtsam-kitti", Path(found.submodule_search_locations[0]) / "Data")
 
 
-def test_no_position_of_the_drive_is_rejected(kitti: Log, tmp_path: Path) -> None:
+def test_hardly_a_position_of_the_drive_is_rejected(kitti: Log, tmp_path: Path) -> None:
+    """Twice the IMU is off by more than it says, and a position must insist before it is believed: at one a second."""
     metrics = replay_source(Memory(kitti), tmp_path / "run", RunConfig())
     counts = metrics["decisions"]["gnss_position"]
-    assert counts["accepted"] >= 465
-    assert "chi_square" not in counts
+    assert counts["accepted"] >= 462
+    assert counts["chi_square"] <= 5
 
 
 def test_drift_over_hidden_seconds_is_as_large_as_stated(kitti: Log, tmp_path: Path) -> None:

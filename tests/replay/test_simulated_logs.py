@@ -26,6 +26,8 @@ def figures(of: Any) -> list[Any]:
     """Everything in metrics, one after the other with its keys."""
     if isinstance(of, dict):
         return [entry for key, value in of.items() for entry in (key, *figures(value))]
+    if isinstance(of, list):
+        return [entry for value in of for entry in figures(value)]
     return [of]
 
 
