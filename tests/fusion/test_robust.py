@@ -135,7 +135,7 @@ def test_tails_of_every_sensor_do_less_harm(drives: list[Drive], without: str) -
     off = {kernel: rms(drives, kernel, 0.1, without) for kernel in KERNELS}
     print(f"without {without or 'none'}: " + ", ".join(f"{kernel} {100 * off[kernel]:.2f} cm" for kernel in KERNELS))
     assert off["huber"] < 0.95 * off["none"]
-    assert off["cauchy"] < 0.85 * off["none"]
+    assert off["cauchy"] < 0.9 * off["none"]
 
 
 def test_where_errors_are_normal_a_kernel_costs_little(drives: list[Drive]) -> None:

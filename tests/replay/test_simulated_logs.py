@@ -39,7 +39,7 @@ def test_a_written_drive_is_replayed_as_the_one_in_memory(tmp_path: Path) -> Non
     in_memory = figures(metrics("scenario:road-test,seed=3,length_km=2", tmp_path / "in_memory"))
     assert len(written) == len(in_memory) > 300
     for one, other in zip(written, in_memory, strict=True):
-        assert one == (pytest.approx(other, rel=0.0, abs=NANOMETRES) if isinstance(other, float) else other)
+        assert one == (pytest.approx(other, rel=1e-8, abs=NANOMETRES) if isinstance(other, float) else other)
 
 
 def test_the_scenario_of_the_docs_along_the_boreas_drive_is_simulated_and_replayed(data: Path, tmp_path: Path) -> None:
