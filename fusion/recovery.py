@@ -82,7 +82,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
     climb = z[2] - mine[2] if which == 0 and clock[0, D_COUNT] > 0 else 0.0
     east, north = c * z[0] - s * z[1], s * z[0] + c * z[1]
     mine[6] = mine[7] = 0.0
-    if clock[which, D_COUNT] > 0 and 0 < now - clock[which, D_TIME] <= FRESH_NS:
+    if in_doubt(core, which, now) and now > clock[which, D_TIME]:
         dt = (now - clock[which, D_TIME]) * 1e-9
         mine[6], mine[7] = (east - mine[0]) / dt, (north - mine[1]) / dt
     mine[0], mine[1], mine[2] = east, north, z[2]
@@ -99,7 +99,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
         clock[which, D_SINCE] = now
     clock[which, D_COUNT] += 1
     clock[which, D_TIME] = now
-    if clock[1 - which, D_COUNT] == 0 or now - clock[1 - which, D_TIME] > FRESH_NS:
+    if not in_doubt(core, 1 - which, now):
         clock[0, D_AGREED] = 0
         if not (_fits_but_for_height(core, par, z) if which == 0 else _fits_but_for_yaw(core, par, z)):
             clock[which, D_COUNT] = max(clock[which, D_COUNT] - 2, 1)

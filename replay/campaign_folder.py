@@ -51,9 +51,8 @@ def campaign_folder(
 ) -> Iterator[dict[str, Any]]:
     """The folder for the time of the block, locked; yields the manifest of the campaign as it was begun.
 
-    Raises EgolocError where something else stands there, or a campaign of other logs or settings.
+    After ``check_place``. Raises EgolocError where a campaign of other logs or settings stands there.
     """
-    check_place(out, resume=resume, overwrite=overwrite)
     with storage(out):
         out.mkdir(parents=True, exist_ok=resume or overwrite)
     with _locked(out):

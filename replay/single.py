@@ -57,10 +57,10 @@ def resumed(source: LogSource, out: Path, job: Job) -> dict[str, Any] | None:
 
 
 def _on_cluster(source: LogSource, out: Path, job: Job, address: str, *, overwrite: bool) -> dict[str, Any]:
-    from replay import cluster
+    from replay.campaign import backend_of
 
     check_free(out, overwrite=overwrite)
-    with cluster.joined(address) as api, closing(cluster.run([Work(source, out)], job, lambda _: None, api)) as ends:
+    with backend_of(1, ray=address) as replay, closing(replay([Work(source, out)], job, lambda _: None)) as ends:
         outcome = next(ends)
     if outcome.end is End.STORAGE:
         raise StorageError(outcome.error)

@@ -83,8 +83,7 @@ class DriveConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         if self.network is not None and self.trajectory is not None:
             raise EgolocError("trajectory: expected no [network] beside it, got both")
         for name in ("gnss_delay_s", "gnss_velocity_delay_s"):
-            if getattr(self.vehicle, name):
-                given = getattr(self.vehicle, name)
+            if given := getattr(self.vehicle, name):
                 raise EgolocError(f"vehicle.{name}: expected 0 (stamps of simulated GNSS are exact), got {given:g}")
 
 
