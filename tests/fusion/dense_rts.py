@@ -17,7 +17,7 @@ import fusion.recovery
 import fusion.update
 from fusion.layout import Layout, used
 from fusion.navigator import Navigator
-from fusion.state import A_T, E_WHEEL_SCALE, Core
+from fusion.state import A_T, Core
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +59,6 @@ class Watch:
             self._watch("widen" if name == "forget" else "give way", fusion.recovery, name, self._same)
         self._watch("widen", fusion._kernels, "widen", self._same)
         self._watch("coast", fusion._kernels, "coast", self._coasted)
-        self._watch("start again", fusion.recovery, "start_again", self._started_again)
         for module, name, kind in (
             *((module, "move", "move") for module in (fusion._kernels, fusion.update)),
             *((module, "renew", "renew") for module in (fusion.observing, fusion.update)),
@@ -132,13 +131,6 @@ class Watch:
 
     def _renew(self, core: Core, first: int) -> Floats:
         return self._fade(core, first, 0.0)
-
-    def _started_again(self, core: Core, *_: Any) -> Floats:
-        phi = np.eye(len(core.P))
-        phi[:E_WHEEL_SCALE] = 0.0
-        for first in (self._layout.gnss_error, self._layout.pose_error):
-            phi[first : first + 3] *= first < 0
-        return phi
 
     def _add(self, kind: str, step: Step) -> None:
         """Without what fills the state up, which has no variance. A transition must explain P but for added noise."""

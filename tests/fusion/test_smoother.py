@@ -61,20 +61,11 @@ def log() -> Log:
     return replace(drive, vehicle=msgspec.structs.replace(drive.vehicle, imu=imu))
 
 
-def overturned(log: Log) -> Log:
-    """A gyro that is wrong by 20 deg/s for six seconds: outvoted, and outvoted again."""
-    assert log.imu is not None
-    s = seconds(log, log.imu.t_ns)
-    gyro = log.imu.gyro + np.where((s > 15.0) & (s < 21.0), np.radians(20.0), 0.0)[:, None] * [1.0, 0.0, 0.0]
-    return replace(log, imu=replace(log.imu, gyro=gyro))
-
-
 ALWAYS = {"move", "correct", "state", "fade"}
 SCENES: dict[str, tuple[Callable[[Log], Log], set[str]]] = {
     "whole": (lambda log: log, set()),
     "rough": (rough, {"coast", "widen", "give way", "renew"}),
     "cut": (lambda log: with_outage(log, 12.0, 14.0), {"cut"}),
-    "starts again": (overturned, {"give way", "start again", "renew"}),
 }
 
 
