@@ -6,6 +6,8 @@ What was recorded stays as it was: states as they were known when the IMU first 
 were made when a measurement was first applied. Met again, a measurement is gated again, and may end otherwise.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,12 +39,11 @@ from fusion.history import (
 )
 from fusion.result import Reason
 from fusion.snapshots import S_FIRST, S_NEWEST, restore, snapshot_before
-from fusion.state import C_COUNT, C_SAMPLE, C_STATE, Core, Floats, Nanoseconds
+from fusion.state import C_COUNT, C_SAMPLE, C_STATE, FOREVER, Core, Floats, Nanoseconds
 from fusion.update import record_decision
+from sensors.held import Held, read
 from sensors.kernel import kernel
 
-FOREVER = 2**63 - 1
-"""After any stamp."""
 _APPLY = -1
 _BEFORE_ALIGNMENT = int(Reason.BEFORE_ALIGNMENT)
 _OUTSIDE_IMU = int(Reason.OUTSIDE_IMU)
@@ -50,26 +51,32 @@ _LATE = int(Reason.LATE)
 _DUPLICATE = int(Reason.DUPLICATE)
 
 
+class Desk(NamedTuple):
+    """What every arrival finds. stamps (M, 3): time, arrival and log row of each recorded decision."""
+
+    core: Core
+    history: History
+    par: Parameters
+    rec: Recorder
+    stamps: NDArray[np.int64]
+
+
 @kernel()
 def arrive(
-    core: Core,
-    history: History,
+    desk: Held[Desk],
     imu_t: Nanoseconds,
     gyro: Floats,
     accel: Floats,
     imu_due: Nanoseconds,
     count: int,
-    par: Parameters,
-    rec: Recorder,
-    stamps: NDArray[np.int64],
 ) -> tuple[int, int, bool]:
     """Take IMU samples and the first ``count`` measurements of the inbox, both sorted by when they are due.
 
-    Of what is due at the same time measurements come first, and share a rewind. stamps (M, 3): time, arrival and log
-    row of each recorded decision. Returns how many samples and measurements were taken, and whether the filter has
-    given up: at a position that finds it hopeless it stays, with the samples that had arrived by then in the ring and
-    the events not met in the history; nothing else is taken.
+    Of what is due at the same time measurements come first, and share a rewind. Returns how many samples and
+    measurements were taken, and whether the filter has given up: at a position that finds it hopeless it stays, with
+    the samples that had arrived by then in the ring and the events not met in the history; nothing else is taken.
     """
+    core, history, par, rec, stamps = read(desk)
     mark, inbox, samples = history.mark, history.inbox, len(imu_t)
     i = j = 0
     while i < samples or j < count:

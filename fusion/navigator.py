@@ -17,7 +17,7 @@ from fusion.recording import decisions, join, states, unused
 from fusion.result import Decisions, Reason, Restart, States
 from fusion.sources import APPLY, RECORDS, Sources, joined, parts, sources, split
 from fusion.spikes import SpikeGate
-from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, H_CAUSE, NAV_SIZE, Core, new_core
+from fusion.state import C_INTERVAL, C_SAMPLE, C_STATE, C_TICK, FOREVER, H_CAUSE, NAV_SIZE, NEVER, Core, new_core
 from fusion.tape import Tape, portions
 from fusion.timeline import merge, parameters
 from sensors import pieces
@@ -26,9 +26,6 @@ from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
 from sensors.records import Imu, Log
 from sensors.vehicle import Vehicle
-
-FOREVER, NEVER = 2**63 - 1, -(2**63)
-"""After and before any stamp."""
 
 
 class Navigator:

@@ -7,11 +7,13 @@ Where the filter gives up, samples and measurements that it has not met wait onc
 final: a measurement from before it is too late, whatever it would have changed.
 """
 
+from operator import is_not
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion.alignment import SERVING, Initial
-from fusion.arrival import arrive
+from fusion.arrival import Desk, arrive
 from fusion.config import FusionConfig
 from fusion.events import Measurements
 from fusion.health import begin
@@ -37,16 +39,17 @@ from fusion.history import (
     with_room,
 )
 from fusion.journal import Journal
-from fusion.navigator import FOREVER, NEVER, Navigator, start
+from fusion.navigator import Navigator, start
 from fusion.recording import unused
 from fusion.result import Decisions, Reason, States
 from fusion.snapshots import with_snapshots
 from fusion.sources import Sources, compact, joined
-from fusion.state import C_COUNT, C_STATE, Core, Nanoseconds
+from fusion.state import C_COUNT, C_STATE, FOREVER, NEVER, Core, Nanoseconds
 from fusion.timeline import periods
 from sensors import pieces
 from sensors.clock import NS_PER_S
 from sensors.geodesy import MapFrame
+from sensors.held import Held
 from sensors.records import Imu, Log
 from sensors.vehicle import Vehicle
 
@@ -80,6 +83,7 @@ class RewindingNavigator(Navigator):
         self._offered: dict[int, int] = {}
         """Of each sensor, the newest measurement that alignment has had."""
         self._history: History | None = None
+        self._desk: Held[Desk] | None = None
         self._columns: Measurements
         self._journal = Journal(self._states, self._decisions, kept)
 
@@ -267,10 +271,17 @@ class RewindingNavigator(Navigator):
             samples = read_only(imu.t_ns), read_only(imu.gyro), read_only(imu.accel), read_only(imu_due)
         count = enter(self._history, self._columns, found, due)
         rec = self._journal.room(outputs + 1, ticks + count + int(mark[M_EVENTS] - mark[M_NEXT]) + 1)
-        i, j, given_up = arrive(core, self._history, *samples, count, self._par, rec, self._journal.stamps)
+        desk = self._laid(Desk(core, self._history, self._par, rec, self._journal.stamps))
+        i, j, given_up = arrive(desk, *samples, count)
         if given_up:
             self._give_back(core, imu, np.maximum(imu_due, self._due_of(imu)), found, (i, j))
         return not given_up
+
+    def _laid(self, desk: Desk) -> Held[Desk]:
+        """The same for the kernel, made anew where one of its parts is another."""
+        if self._desk is None or any(map(is_not, self._desk.value, desk)):
+            self._desk = Held(desk)
+        return self._desk
 
     def _give_back(self, core: Core, imu: Imu, imu_due: Nanoseconds, found: Sources, taken: tuple[int, int]) -> None:
         """Give the state up; what it has not met waits, from its time on. imu, found: of which so many were taken."""

@@ -6,11 +6,12 @@ import numpy as np
 
 from fusion.calibration import estimates
 from fusion.config import FusionConfig
-from fusion.navigator import FOREVER, Navigator
+from fusion.navigator import Navigator
 from fusion.recording import join
 from fusion.result import FusionResult, Reason
 from fusion.rewinding import RewindingNavigator
 from fusion.sources import RECORDS
+from fusion.state import FOREVER, NEVER
 from fusion.tape import Tape
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
@@ -118,4 +119,4 @@ def _spikes(count: int) -> tuple[LeftOut, ...]:
 
 def _last_stamp(piece: Log) -> int:
     records = [record for name in RECORDS if (record := getattr(piece, name)) is not None and len(record)]
-    return max((int(record.t_ns[-1]) for record in records), default=-(2**63) + _START_NS)
+    return max((int(record.t_ns[-1]) for record in records), default=NEVER)

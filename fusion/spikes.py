@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fusion.config import ImuNoise
 from fusion.history import read_only
-from fusion.state import Floats, Nanoseconds
+from fusion.state import NEVER, Floats, Nanoseconds
 from sensors.kernel import kernel
 from sensors.records import Imu
 
@@ -28,7 +28,7 @@ class SpikeGate:
     def __init__(self, config: ImuNoise) -> None:
         self._limits = (float(np.radians(config.spike_rate_deg)), config.spike_force)
         self._gap_ns = round(config.max_gap_s * 1e9)
-        self._values, self._clock = np.zeros((3, 6)), np.array([-(2**62), 0])
+        self._values, self._clock = np.zeros((3, 6)), np.array([NEVER, 0])
         self.held_back = 0
         """So many samples so far."""
 

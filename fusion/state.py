@@ -89,8 +89,8 @@ D_COUNT, D_TIME, D_AGREED, D_BELIEVED, D_SINCE, D_STREAK, D_LAST, D_TRACKING, D_
 # columns of Core.trust: when a measurement was last judged, last explained; how many more were not than were
 T_SEEN, T_GOOD, T_DOUBT = range(3)
 
-NEVER = -(2**62)
-"""Before any stamp."""
+NEVER, FOREVER = -(2**62), 2**63 - 1
+"""Before and after any stamp. From NEVER a stamp can be subtracted."""
 
 # entries of Core.clock
 C_STATE, C_SAMPLE, C_TICK, C_COUNT, C_BEND, C_INTERVAL = range(6)

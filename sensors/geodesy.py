@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyproj import Proj
 
 from sensors.errors import EgolocError
+from sensors.grid import grid_rotations
 
 Floats = NDArray[np.float64]
 
@@ -110,25 +111,16 @@ def llh_from_map(frame: MapFrame, p_map: ArrayLike) -> Floats:
 def rotation_map_enu(frame: MapFrame, llh: ArrayLike) -> tuple[Floats, Floats]:
     """(N, 3, 3) R_map_enu, the local ENU axes seen in map axes, and (N,) the map's scale there.
 
-    utm: the meridian convergence and the point scale of the ellipsoid's surface (height excluded), from the map image
-    of 200 m of meridian around each point (1e-9 of pyproj's own factors). enu: earth's curvature, scale 1.
+    utm: the meridian convergence and the point scale of the ellipsoid's surface (height excluded), ``sensors.grid``.
+    enu: earth's curvature, scale 1.
     """
-    points = np.asarray(llh, np.float64)
+    points = np.ascontiguousarray(llh, np.float64)
     if frame.kind == "enu":
         to_datum = rotation_ecef_enu(np.array([_datum(frame)]))[0].T
         return to_datum @ rotation_ecef_enu(points), np.ones(len(points))
-    step = 100.0 / 6_371_000.0
-    lat, lon = points[:, 0], points[:, 1]
-    ends = np.concatenate((lat + step, lat - step))
-    x, y = _utm(frame.zone, frame.south)(np.concatenate((lon, lon)), ends, radians=True)
-    east, north = x[: len(lat)] - x[len(lat) :], y[: len(lat)] - y[len(lat) :]
-    length = np.hypot(east, north)
-    rotation = np.zeros((len(lat), 3, 3))
-    rotation[:, 0, 0] = rotation[:, 1, 1] = north / length
-    rotation[:, 0, 1], rotation[:, 1, 0] = east / length, -east / length
-    rotation[:, 2, 2] = 1.0
-    arc = 2 * step * meridian_radius(lat)
-    return rotation, length / arc
+    rotation, scale = np.empty((len(points), 3, 3)), np.empty(len(points))
+    grid_rotations(points, np.radians(6.0 * frame.zone - 183.0), rotation, scale)
+    return rotation, scale
 
 
 def meridian_radius(lat: ArrayLike) -> Floats:
