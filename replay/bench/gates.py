@@ -9,7 +9,8 @@ from typing import Any
 import msgspec
 from rich.table import Table
 
-from fusion.config import FusionConfig, Gates, HealthModel, PoseModel
+from fusion.config import FusionConfig, Gates, HealthModel
+from fusion.sensor_models import PoseModel
 from replay.bench.gate_scenes import DURATION_S, SCENES, Method, informed
 from replay.bench.measure import conditions, row
 from replay.config import RunConfig
