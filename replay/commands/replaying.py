@@ -54,9 +54,12 @@ class Replay:
     """Apply measurements by when they were true, or as they came: late ones by rewinding, states as known then."""
     estimate: Annotated[str | None, tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: the config's)")] = None
     """Estimate these along the way: lever-arm, mounting, gyro, delays (or gnss-delay, pose-delay), with commas."""
-    inject: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
-    """Make sensors fail, as in gnss-jump:severe@60+20: NAME[:mild|medium|severe][@BEGIN[+LENGTH]] in s since the first
-    IMU sample; several with commas or --inject again. Names: docs/faults.md; an unknown one lists them."""
+    inject: Annotated[
+        tuple[str, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="SPEC", help_behavior_hint="(repeatable; default severity medium, begin 60)"),
+    ] = ()
+    """Make sensors fail: NAME[:mild|medium|severe][@BEGIN[+LENGTH]], in s, with commas. An unknown NAME lists them all."""
     smooth: bool = False
     """Smooth each drive as well, backwards from its end: one more row; smoothed.parquet, which --reference reads."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
