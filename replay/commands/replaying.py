@@ -59,7 +59,7 @@ class Replay:
         tyro.conf.UseAppendAction,
         tyro.conf.arg(metavar="SPEC", help_behavior_hint="(repeatable; default severity medium, begin 60)"),
     ] = ()
-    """Make sensors fail: NAME[:mild|medium|severe][@BEGIN[+LENGTH]], in s, with commas. An unknown NAME lists them all."""
+    """Make sensors fail: NAME[:mild|medium|severe][@BEGIN[+LENGTH]], in s, with commas. An unknown NAME lists all."""
     smooth: bool = False
     """Smooth each drive as well, backwards from its end: one more row; smoothed.parquet, which --reference reads."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
