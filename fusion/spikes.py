@@ -7,8 +7,8 @@ step was real and is followed, one sample late. No more than MOST samples in a r
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.config import ImuNoise
 from fusion.history import read_only
+from fusion.sensor_models import ImuNoise
 from fusion.state import NEVER, Floats, Nanoseconds
 from sensors.kernel import kernel
 from sensors.records import Imu

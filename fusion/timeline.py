@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from fusion.config import KERNELS, FusionConfig, ImuNoise, check
+from fusion.config import KERNELS, FusionConfig, check
 from fusion.covariance import Noise
 from fusion.divergence import HealthLimits
 from fusion.events import MOTION, OUTPUT, Events, Parameters
 from fusion.layout import layout_of
+from fusion.sensor_models import ImuNoise
 from fusion.sources import APPLY, Sources
 from sensors.vehicle import ImuSpec, Vehicle
 

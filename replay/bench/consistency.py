@@ -17,8 +17,9 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
-from fusion.config import FusionConfig, GnssModel, ImuNoise, MotionModel, PoseModel
+from fusion.config import FusionConfig
 from fusion.navigator import Navigator
+from fusion.sensor_models import GnssModel, ImuNoise, MotionModel, PoseModel
 from fusion.state import (
     ACCEL_BIAS,
     C_STATE,

@@ -19,8 +19,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fusion.config import FusionConfig, MotionModel
+from fusion.config import FusionConfig
 from fusion.run import run as fuse
+from fusion.sensor_models import MotionModel
 from replay.bench.measure import conditions, rate, row, times
 from replay.bench.peers import peer_drive
 from sensors.records import Log

@@ -4,18 +4,22 @@ Every way is a config of the same filter. AR and the largest error are those of 
 seeds that nothing was tuned on.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
+from rich.console import Group, RenderableType
 from rich.table import Table
 
-from fusion.config import FusionConfig, Gates, HealthModel, PoseModel
+from fusion.config import FusionConfig, Gates, HealthModel
+from fusion.sensor_models import PoseModel
 from replay.bench.gate_scenes import DURATION_S, SCENES, Method, informed
 from replay.bench.measure import conditions, row
 from replay.config import RunConfig
 from replay.drive import Drive
 from replay.metrics import metrics_of
 from replay.scoring import Scorer
+from replay.table import bare_table
 from sensors.records import Log
 
 FIRST_SEED = 700_000
@@ -78,19 +82,25 @@ def scored(log: Log, config: FusionConfig) -> tuple[float, float]:
     return fusion["ar"], max(fusion[axis]["max"] for axis in ("lon", "lat"))
 
 
-def table(result: dict[str, Any]) -> Table:
-    """A block for each scene: median and worst AR, median and largest error."""
-    from replay.table import bare_table
-
-    shown = bare_table(2)
-    for header in ("scene", "gates"):
-        shown.add_column(header)
-    for header in ("AR %", "worst", "peak m", "worst"):
-        shown.add_column(header, justify="right")
+def table(result: dict[str, Any]) -> RenderableType:
+    """Scenes by ways of gating: AR, and the largest error; of the drives the median, and the worst in brackets."""
     rows = {(entry["name"], entry["metric"]): entry for entry in result["rows"]}
+    return Group(
+        _by_way("AR %, median (worst)", lambda name: _cell(rows[name, "ar"], "min", 100.0, 1)),
+        _by_way("largest error m, median (worst)", lambda name: _cell(rows[name, "peak_m"], "max", 1.0, 2)),
+    )
+
+
+def _by_way(title: str, cell: Callable[[str], str]) -> Table:
+    """cell: of a row's name."""
+    shown = bare_table(2)
+    shown.add_column(title)
+    for way in METHODS:
+        shown.add_column(way, justify="right", no_wrap=True)
     for scene in SCENES:
-        for number, name in enumerate(METHODS):
-            ar, peak = (rows[f"{scene}: {name}", metric] for metric in ("ar", "peak_m"))
-            figures = (100 * ar["median"], 100 * ar["min"], peak["median"], peak["max"])
-            shown.add_row(scene if number == 0 else "", name, *(f"{figure:.2f}" for figure in figures))
+        shown.add_row(scene, *(cell(f"{scene}: {way}") for way in METHODS))
     return shown
+
+
+def _cell(entry: dict[str, Any], worst: str, factor: float, digits: int) -> str:
+    return f"{factor * entry['median']:.{digits}f} ({factor * entry[worst]:.{digits}f})"

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.config import ImuNoise
 from fusion.covariance import Noise
+from fusion.sensor_models import ImuNoise
 from fusion.timeline import noise_of
 from sensors.geodesy import enu_from_llh, llh_from_map, rotation_map_enu
 from sensors.records import Log

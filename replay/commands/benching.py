@@ -11,12 +11,15 @@ import tyro
 from replay.commands.output import print_json, stage
 from sensors.errors import EgolocError
 
+Number = Annotated[int, tyro.conf.arg(metavar="N")]
+Hours = Annotated[float, tyro.conf.arg(metavar="H")]
+
 
 @dataclass(frozen=True)
 class BenchFilter:
     """IMU steps/s of the whole filter, beside filterpy, gtsam and pyins, on one core."""
 
-    repeats: int = 5
+    repeats: Number = 5
     """Timed calls of each row, after one that warms up; the median counts."""
     json: bool = False
     """Print JSON."""
@@ -25,6 +28,7 @@ class BenchFilter:
         """Run the benchmark."""
         from replay.bench import filter
 
+        _at_least_one(repeats=self.repeats)
         _timed("filter", lambda: filter.run(self.repeats), self.json)
 
 
@@ -32,9 +36,9 @@ class BenchFilter:
 class BenchLive:
     """Time of a call of Localizer.push in arrival order, on one core."""
 
-    repeats: int = 5
-    """Drives of which each call's least time counts."""
-    hours: float = 1.0
+    repeats: Number = 3
+    """Passes over the drive: their median counts, and of each call its least time."""
+    hours: Hours = 1.0
     """Length of the drive, h."""
     json: bool = False
     """Print JSON."""
@@ -43,6 +47,8 @@ class BenchLive:
         """Run the benchmark."""
         from replay.bench import live
 
+        _at_least_one(repeats=self.repeats)
+        _above_zero(hours=(self.hours,))
         _timed("live", lambda: live.run(self.repeats, (self.hours,)), self.json)
 
 
@@ -50,9 +56,9 @@ class BenchLive:
 class BenchReplay:
     """A log to metrics.json: times real time, stages and memory, on one core."""
 
-    repeats: int = 5
+    repeats: Number = 5
     """Timed runs, after one that warms up; the median counts."""
-    hours: tuple[float, ...] = (1.0,)
+    hours: Annotated[tuple[float, ...], tyro.conf.arg(metavar="H [H ...]")] = (1.0,)
     """Lengths of the log, h: figures of each and how the time grows."""
     json: bool = False
     """Print JSON."""
@@ -61,6 +67,8 @@ class BenchReplay:
         """Run the benchmark."""
         from replay.bench import replay
 
+        _at_least_one(repeats=self.repeats)
+        _above_zero(hours=self.hours)
         _timed("replay", lambda: replay.run(self.repeats, self.hours), self.json)
 
 
@@ -68,7 +76,7 @@ class BenchReplay:
 class BenchMcap:
     """IMU messages/s read from MCAP, beside the mcap package's own decoders, on one core."""
 
-    repeats: int = 5
+    repeats: Number = 5
     """Timed calls of each row, after one that warms up; the median counts."""
     json: bool = False
     """Print JSON."""
@@ -77,6 +85,7 @@ class BenchMcap:
         """Run the benchmark."""
         from replay.bench import mcap
 
+        _at_least_one(repeats=self.repeats)
         _timed("mcap", lambda: mcap.run(self.repeats), self.json)
 
 
@@ -84,7 +93,7 @@ class BenchMcap:
 class BenchGates:
     """Naive gates beside ours, on scenes in which a naive one fails: AR and largest errors."""
 
-    drives: int = 5
+    drives: Number = 5
     """Simulated drives of each scene."""
     json: bool = False
     """Print JSON."""
@@ -93,6 +102,7 @@ class BenchGates:
         """Run the benchmark."""
         from replay.bench import gates
 
+        _at_least_one(drives=self.drives)
         _printed("gates", lambda _: gates.run(self.drives), gates.table, self.json)
 
 
@@ -100,9 +110,9 @@ class BenchGates:
 class BenchFaults:
     """Errors, recovery and warnings for every fault that --inject knows, on simulated drives."""
 
-    drives: int = 4
+    drives: Number = 4
     """Simulated drives; figures are the worst of them."""
-    seed: int = 6000
+    seed: Number = 6000
     """Seed of the first of them."""
     short: bool = False
     """One drive and the medium severity alone."""
@@ -117,8 +127,9 @@ class BenchFaults:
         from replay.fault_tables import fault_tables, markdown
         from replay.table import output_console
 
-        if self.drives < 1 or self.seed < 0:
-            raise EgolocError(f"bench: --drives, --seed: expected 1 or more, 0 or more, got {self.drives}, {self.seed}")
+        _at_least_one(drives=self.drives)
+        if self.seed < 0:
+            raise EgolocError(f"--seed: expected 0 or more, got {self.seed}")
         with stage("benchmark faults") as tell:
             found = faults.matrix_of(self.drives, self.seed, short=self.short, tell=tell)
         if self.markdown is not None:
@@ -138,20 +149,24 @@ class BenchHidden:
         tyro.conf.arg(metavar="LOG...", help_behavior_hint="(default: simulated drives of three IMU grades)"),
     ] = ()
     """Recorded logs."""
-    lengths: tuple[float, ...] = (15.0, 60.0)
+    lengths: Annotated[tuple[float, ...], tyro.conf.arg(metavar="S [S ...]")] = (15.0, 60.0)
     """How long GNSS is hidden, s."""
-    every: float = 10.0
+    every: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
     """From the start of a stretch to that of the next, s."""
-    begin: Annotated[tuple[float, ...], tyro.conf.arg(name="from")] = (60.0,)
-    """Stretches begin so long after the first GNSS position at least; several make as many windows, s."""
-    end: Annotated[tuple[float, ...], tyro.conf.arg(name="to", help_behavior_hint="(default: the log's end)")] = ()
-    """They end so long after it at most, one number for each --from, s."""
+    begin: Annotated[tuple[float, ...], tyro.conf.arg(name="from", metavar="S [S ...]")] = (60.0,)
+    """Earliest begin of a stretch, s after the first GNSS position; each number begins a window."""
+    end: Annotated[
+        tuple[float, ...],
+        tyro.conf.arg(name="to", metavar="S [S ...]", help_behavior_hint="(default: the log's end)"),
+    ] = ()
+    """Latest end of a stretch, s after the first GNSS position; one for each --from."""
     peers: Annotated[
-        tuple[Literal["pyins", "gtsam"], ...] | None, tyro.conf.arg(help_behavior_hint="(default: those installed)")
+        tuple[Literal["pyins", "gtsam"], ...] | None,
+        tyro.conf.arg(metavar="{pyins,gtsam}", help_behavior_hint="(default: those installed)"),
     ] = None
-    """Which others are run."""
+    """Which others are run, one or both."""
     halves: bool = False
-    """Rows of the drive's first and second half as well: importers calibrate on the first."""
+    """Also rows of the drive's first and of its second half: importers calibrate on the first."""
     json: bool = False
     """Print JSON."""
 
@@ -169,7 +184,7 @@ class BenchHidden:
 class BenchConsistency:
     """Whether the filter's sigmas are honest: NEES of simulated drives, and P over a day."""
 
-    seeds: int = 200
+    seeds: Number = 200
     """Simulated drives of each case."""
     config: Annotated[
         Path | None, tyro.conf.arg(metavar="FILE.toml", help_behavior_hint="(default: the default configuration)")
@@ -183,8 +198,7 @@ class BenchConsistency:
         from replay.bench import consistency
         from replay.config import load_config
 
-        if self.seeds < 1:
-            raise EgolocError(f"--seeds: expected 1 or more, got {self.seeds}")
+        _at_least_one(seeds=self.seeds)
         config = None if self.config is None else load_config(self.config).fusion
         work = lambda tell: consistency.run(self.seeds, config=config, watch=tell)  # noqa: E731
         _printed("consistency", work, consistency.table, self.json)
@@ -211,6 +225,22 @@ def hidden_windows(begin: tuple[float, ...], end: tuple[float, ...]) -> list[tup
         if not 0.0 <= first < last:
             raise EgolocError(f"--from, --to: expected 0 <= from < to, got {first:g} and {last:g}")
     return windows
+
+
+def _at_least_one(**options: int) -> None:
+    """Raise for an option, by its name, of which there are none."""
+    for name, value in options.items():
+        if value < 1:
+            raise EgolocError(f"--{name}: expected 1 or more, got {value}")
+
+
+def _above_zero(**options: tuple[float, ...]) -> None:
+    """Raise for an option, by its name, without numbers or with one that is no length of time."""
+    for name, values in options.items():
+        if not values or not all(0.0 < value < math.inf for value in values):
+            raise EgolocError(
+                f"--{name}: expected numbers above 0, got {', '.join(f'{v:g}' for v in values) or 'none'}"
+            )
 
 
 def _timed(name: str, work: Callable[[], Any], as_json: bool) -> None:

@@ -23,7 +23,7 @@ class View:
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """A run folder."""
     other: Annotated[
-        tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RUN_B", help_behavior_hint="(default: none)")
+        tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RUN_B]", help_behavior_hint="(default: none)")
     ] = None
     """A second run of the same log, to compare by eye."""
     rrd: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd", help_behavior_hint="(default: in or beside RUN)")] = (

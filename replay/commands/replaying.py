@@ -36,7 +36,7 @@ class Replay:
     config: Annotated[
         Path | None, tyro.conf.arg(metavar="FILE.toml", help_behavior_hint="(default: none, as if empty)")
     ] = None
-    """TOML with any of [topics], [vehicle], [map_frame], [fusion], [limits], [hide_gnss]; the rest has defaults."""
+    """TOML with what differs from the defaults; config.toml in a run folder lists every table, key and value."""
     limits: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the config's, else paper)")
     ] = None
@@ -48,16 +48,20 @@ class Replay:
     ] = None
     """Hide GNSS for LENGTH s every EVERY s, as in 60:15, and score against the RTK-fixed fixes that were hidden."""
     order: Annotated[
-        Literal["stamp", "arrival"] | None, tyro.conf.arg(help_behavior_hint="(default: the config's, else stamp)")
+        Literal["stamp", "arrival"] | None,
+        tyro.conf.arg(metavar="{stamp,arrival}", help_behavior_hint="(default: the config's, else stamp)"),
     ] = None
-    """Measurements by when they were true, or as they came: late ones by rewinding, states as they were known then."""
+    """Apply measurements by when they were true, or as they came: late ones by rewinding, states as known then."""
     estimate: Annotated[str | None, tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: the config's)")] = None
-    """Find these along the way: lever-arm, mounting, gyro, delays (gnss-delay, pose-delay), as in mounting,delays."""
-    inject: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
-    """Make sensors fail, as in gnss-jump:severe@60+20: NAME[:mild|medium|severe][@BEGIN[+LENGTH]] in s since the first
-    IMU sample; several with commas or --inject again. Names: docs/faults.md, or any other word."""
+    """Estimate these along the way: lever-arm, mounting, gyro, delays (or gnss-delay, pose-delay), with commas."""
+    inject: Annotated[
+        tuple[str, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="SPEC", help_behavior_hint="(repeatable; default severity medium, begin 60)"),
+    ] = ()
+    """Make sensors fail: NAME[:mild|medium|severe][@BEGIN[+LENGTH]], in s, with commas. An unknown NAME lists all."""
     smooth: bool = False
-    """Smooth each drive as well, backwards from its end: a row more, and smoothed.parquet, which --reference reads."""
+    """Smooth each drive as well, backwards from its end: one more row; smoothed.parquet, which --reference reads."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one per core)")] = None
     """Logs replayed at a time, each in a process of its own."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")] = None

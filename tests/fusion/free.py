@@ -6,10 +6,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion.alignment import Initial
-from fusion.config import Alignment, FusionConfig, Gates, GnssModel, ImuNoise, MotionModel, PoseModel
+from fusion.config import Alignment, FusionConfig, Gates
 from fusion.events import Events, Measurements, Recorder, new_recorder
 from fusion.navigator import feed, start
 from fusion.result import Sensor
+from fusion.sensor_models import GnssModel, ImuNoise, MotionModel, PoseModel
 from fusion.sources import APPLY, sources, split
 from fusion.state import ACCEL_BIAS, E_ATTITUDE, E_VELOCITY, ERROR_SIZE, GYRO_BIAS, LLH, QUATERNION, VELOCITY, Core
 from fusion.timeline import merge, parameters

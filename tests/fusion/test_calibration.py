@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from fusion.blocks import see_delay
 from fusion.calibration import EXCITED, estimates
-from fusion.config import Estimate, FusionConfig, Gates, ImuNoise
+from fusion.config import Estimate, FusionConfig, Gates
 from fusion.filter import Localizer
 from fusion.innovations import joint
 from fusion.result import Estimated, Sensor
 from fusion.run import Session, run
+from fusion.sensor_models import ImuNoise
 from fusion.state import Floats
 from sensors.clock import NS_PER_S
 from sensors.geodesy import enu_from_llh

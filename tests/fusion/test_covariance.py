@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion.config import FusionConfig, ImuNoise
+from fusion.config import FusionConfig
 from fusion.covariance import Noise, coast, propagate, transition
 from fusion.events import OUTPUT
 from fusion.filter import Localizer
 from fusion.run import run
+from fusion.sensor_models import ImuNoise
 from fusion.state import A_S, E_ATTITUDE, E_POSITION, E_VELOCITY, E_WHEEL_SCALE, ERROR_SIZE, ROW
 from fusion.timeline import noise_of
 from sensors.simulate import scenarios

@@ -8,10 +8,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion.config import FusionConfig, Gates, GnssModel
+from fusion.config import FusionConfig, Gates
 from fusion.gating import diagonalize, innovate, observed_directions, whiten
 from fusion.result import Decisions, Reason, Sensor
 from fusion.run import run
+from fusion.sensor_models import GnssModel
 from fusion.state import ROW
 from fusion.timeline import parameters
 from sensors.records import Log

@@ -6,11 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusion.config import FusionConfig, PoseModel
+from fusion.config import FusionConfig
 from fusion.gating import observed_directions
 from fusion.modes import observed_without, spread_of
 from fusion.result import Reason, Sensor
 from fusion.run import Session, joined, run
+from fusion.sensor_models import PoseModel
 from fusion.sources import pose_columns
 from fusion.state import ROW
 from sensors.geodesy import MapFrame

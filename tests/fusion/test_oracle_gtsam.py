@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fusion.config import Gates, ImuNoise
+from fusion.config import Gates
+from fusion.sensor_models import ImuNoise
 from fusion.state import ERROR_SIZE
 from fusion.timeline import noise_of
 from sensors._kernels import EARTH_RATE, gravity_enu

@@ -6,9 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusion.config import FusionConfig, Gates, GnssModel, ImuNoise, MotionModel, PoseModel
+from fusion.config import FusionConfig, Gates
 from fusion.result import FusionResult, Reason, Sensor
 from fusion.run import run
+from fusion.sensor_models import GnssModel, ImuNoise, MotionModel, PoseModel
 from sensors.errors import EgolocError
 from sensors.geodesy import enu_from_llh
 from sensors.records import GnssStatus

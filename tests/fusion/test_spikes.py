@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fusion.config import ImuNoise
 from fusion.run import run
+from fusion.sensor_models import ImuNoise
 from fusion.spikes import MOST, SpikeGate
 from sensors.records import Imu
 from sensors.simulate import scenarios

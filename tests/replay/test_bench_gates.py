@@ -138,16 +138,12 @@ def test_the_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
     assert row["min"] == row["median"] == row["max"] < 0.95
     assert main(["bench", "gates", "--drives", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    line = next(text for text in lines if "wrong RTK fix" in text)
-    assert line.split() == [
-        "wrong",
-        "RTK",
-        "fix",
-        "accept",
-        "everything",
-        *([f"{100 * row['median']:.2f}"] * 2),
-        *line.split()[-2:],
-    ]
+    shares, errors = (text.split()[3:] for text in lines if text.startswith("wrong RTK fix"))
+    assert shares[:2] == [f"{100 * row['median']:.1f}", f"({100 * row['min']:.1f})"]
+    peak = next(
+        entry for entry in result["rows"] if entry["name"] == "wrong RTK fix: ours" and entry["metric"] == "peak_m"
+    )
+    assert errors[2:] == [f"{peak['median']:.2f}", f"({peak['max']:.2f})"]
 
 
 def test_every_scene_says_what_goes_wrong() -> None:

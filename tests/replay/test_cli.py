@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from replay.cli import COMMANDS, main
+from replay.commands.benching import BENCHMARKS
 from replay.store import file_hash
 from sensors.mcap.io import write_log
 from sensors.records import Log
@@ -284,7 +285,9 @@ def test_the_demo_of_a_campaign_stands_beside_the_paper(tmp_path: Path, capsys: 
     assert "expected --campaign with it" in refused(capsys, "demo", "--workers", "2")
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
+@pytest.mark.parametrize(
+    "command", [[], *([name] for name in COMMANDS), ["bench"], *(["bench", name] for name in BENCHMARKS)]
+)
 def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         main([*command, "--help"])
@@ -300,6 +303,16 @@ def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFi
         main(arguments)
     assert stopped.value.code == 2
     assert capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["filter --repeats", "live --repeats", "live --hours", "replay --hours", "mcap --repeats", "gates --drives"],
+)
+def test_a_benchmark_of_nothing_is_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(capsys, "bench", *option.split(), "0")
+    assert option.split()[1] in said
+    assert said.endswith(", got 0\n")
 
 
 def test_an_interrupt_is_no_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

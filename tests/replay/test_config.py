@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusion.config import FusionConfig, GnssModel
+from fusion.config import FusionConfig
+from fusion.sensor_models import GnssModel
 from replay.config import HideGnss, Limits, RunConfig, load_config, load_vehicle, parse_hide_gnss, to_toml
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
