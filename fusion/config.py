@@ -122,6 +122,8 @@ class HealthModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Positions of two sensors need contradict the state for no longer than this to call it diverged, s."""
     settled_s: NonNegative = 30.0
     """So long after it gave way to one sensor alone, or to two again, the filter is degraded (unsettled), s."""
+    lasting_sigmas: Positive = 5.0
+    """Where an error that lasts would have to be so many of its own sigmas its sensor contradicts the rest, -."""
     max_speed: Positive = 150.0
     """A land vehicle that is faster has diverged, m/s."""
     max_tilt_deg: Positive = 60.0

@@ -54,6 +54,9 @@ class HealthLimits(NamedTuple):
     wide_yaw_var: float
     far_m: float
     course_speed2: float
+    lasting: tuple[int, int]
+    """First states of the errors that last, of GNSS and of pose fixes (``fusion.layout``)."""
+    lasting_sigmas: float
 
 
 @kernel()
@@ -125,11 +128,16 @@ def heard(core: Core, sensor: int) -> bool:
 
 @kernel()
 def _off(core: Core) -> float:
-    """How far off the state is by the sensor that says least, m."""
+    """How far off the state is by the sensor that says least, m.
+
+    Pose fixes: by the last one and by what they have been saying (``fusion.streak``), of which a gross frame is none.
+    """
     least = math.inf
     for which, sensor in ((0, _GNSS), (1, _POSE)):
         if heard(core, sensor):
             least = min(least, math.hypot(core.doubt[which, 0], core.doubt[which, 1]))
+    if heard(core, _POSE):
+        least = min(least, math.hypot(core.doubt[1, 8], core.doubt[1, 9]))
     return least
 
 

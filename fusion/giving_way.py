@@ -15,6 +15,8 @@ MOST_TILT_VAR = 0.5**2
 """But of no more than this, rad^2."""
 ALONE_DOUBLING_S = 4.0
 """GNSS alone, rejected all the time: the state's sigmas double in this time."""
+GYRO_BIAS_WALK, ACCEL_BIAS_WALK = 0.0002, 0.02
+"""As long as GNSS alone contradicts the state the IMU's biases may change so fast, rad/s and m/s^2 per sqrt(s)."""
 GYRO_BIAS_VAR = 0.0005**2
 """Doubt of the gyro's bias, (rad/s)^2."""
 ACCEL_BIAS_VAR = 0.05**2
@@ -29,15 +31,19 @@ UPWARDS_BIAS_VAR = 0.3**2
 
 @kernel()
 def forget(P: Floats, seconds: float, moving: bool) -> None:
-    """Widen position, velocity and attitude for the time that GNSS alone has contradicted them.
+    """Widen position, velocity and attitude for the time that GNSS alone has contradicted them, and the IMU's biases.
 
-    moving: else the yaw is left, since positions of a vehicle that stands say nothing of it.
+    moving: else the yaw is left, since positions of a vehicle that stands say nothing of it. A bias that has changed
+    widens it none the less, by the time it lasts; at rest, where zero rates show the gyro's, not at all.
     """
     grown = 4.0 ** (seconds / ALONE_DOUBLING_S)
     count = 9 if moving else 8
     for i in range(count):
         for j in range(count):
             P[i, j] *= grown
+    for i in range(3):
+        P[9 + i, 9 + i] += GYRO_BIAS_WALK**2 * seconds
+        P[12 + i, 12 + i] += ACCEL_BIAS_WALK**2 * seconds
 
 
 @kernel()

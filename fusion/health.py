@@ -37,7 +37,7 @@ SOURCES = (Sensor.GNSS_POSITION, Sensor.GNSS_VELOCITY, Sensor.GNSS_YAW, Sensor.P
 _HEALTHY, _DEGRADED, _RECOVERED = int(Health.HEALTHY), int(Health.DEGRADED), int(Health.RECOVERED)
 _DEAD_RECKONING, _DIVERGED = int(Health.DEAD_RECKONING), int(Health.DIVERGED)
 _NONE, _SIGMA, _REJECTED, _TILTED = int(Cause.NONE), int(Cause.SIGMA), int(Cause.REJECTED), int(Cause.TILTED)
-_UNSETTLED = int(Cause.UNSETTLED)
+_UNSETTLED, _LASTING_ERROR = int(Cause.UNSETTLED), int(Cause.LASTING_ERROR)
 _ABSENT, _STALE, _SUSPECT, _GOOD = (int(level) for level in Level)
 _GNSS, _YAW, _POSE = int(Sensor.GNSS_POSITION), int(Sensor.GNSS_YAW), int(Sensor.POSE_FIX)
 _COUNT = len(SOURCES)
@@ -112,6 +112,12 @@ def gave_way(clock: Nanoseconds, settled: int, alone: bool, now: int) -> bool:
     return again
 
 
+@kernel(inline="always")
+def in_question(clock: Nanoseconds, settled: int, now: int) -> bool:
+    """Whether positions contradict the state, or it gave way to them of late. clock: Core.health."""
+    return bool(clock[H_COUNT] > 0 or now - clock[H_GAVE] <= settled)
+
+
 @kernel()
 def level_of(trust: Nanoseconds, stale: int, suspect: int, sensor: int, now: int) -> int:
     """The Level of one of SOURCES. trust: Core.trust; stale: after so many ns."""
@@ -153,8 +159,28 @@ def _weakness(core: Core, limits: HealthLimits, now: int) -> int:
     for sensor in range(_COUNT):
         if _ABSENT < level_of(core.trust, limits.stale_ns[sensor], limits.suspect, sensor, now) < _GOOD:
             return sensor + 1
+    if _strained(core, limits):
+        return _LASTING_ERROR
     P = core.P
     return _SIGMA if P[0, 0] + P[1, 1] > limits.sigma_var or P[8, 8] > limits.sigma_yaw_var else _NONE
+
+
+@kernel()
+def _strained(core: Core, limits: HealthLimits) -> bool:
+    """Whether what lasts of a horizontal position's error, or of a pose fix's yaw, has grown beyond what it can be.
+
+    Its states have unit variance (``fusion.blocks``). They take in what a sensor says against the rest as long as it
+    says so smoothly, and the gate sees nothing of it: a drift, or a yaw that an IMU has turned.
+    """
+    gnss, pose = limits.lasting
+    most = 0.0
+    for k in range(2):
+        if gnss >= 0:
+            most = max(most, abs(core.nav[gnss + k + 1]))
+    for k in range(3):
+        if pose >= 0:
+            most = max(most, abs(core.nav[pose + k + 1]))
+    return most > limits.lasting_sigmas
 
 
 @kernel(inline="always")

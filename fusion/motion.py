@@ -5,6 +5,7 @@ import numpy as np
 from fusion._linalg import Vector, attitude, matvec, matvec_t
 from fusion.events import Parameters
 from fusion.gating import correct, innovate, whiten
+from fusion.health import in_question
 from fusion.measurements import body_velocity
 from fusion.result import Sensor
 from fusion.state import C_COUNT, C_TICK, E_WHEEL_SCALE, H_START, RING_SIZE, Core, Floats, Nanoseconds
@@ -23,6 +24,8 @@ PLACED = 0.3
 """Residuals of the non-holonomic update are learned from while the place is known so well, m: by GNSS or a map."""
 REMEMBERED = 60.0
 """So many blocks of residuals are looked back on."""
+JUMPED_VAR = 0.001**2
+"""Doubt of a gyro's bias at every tick at rest that does not fit it, (rad/s)^2."""
 PRIOR_BLOCKS = 3.0
 """What is thought of the rear axle at first counts as so many blocks."""
 
@@ -171,7 +174,7 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
         quiet = full and still(core.quietest, par, norm, turning) and drift < par.still_drift_var
         quiet = quiet and unaccelerated(core, par, force)
         if quiet:
-            _zero_rate(core, par, (residual[0], residual[1], residual[2]))
+            _zero_rate(core, par, (residual[0], residual[1], residual[2]), now)
     core.clock[C_TICK] = now
     clear(R)
     clear(core.H)
@@ -204,8 +207,11 @@ def motion(core: Core, par: Parameters, now: int, rate: Vector) -> tuple[int, in
 
 
 @kernel(inline="always")
-def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
-    """At rest the gyro shows its bias and the earth's turning: mean = bg + R' omega_ie. Gated, but not recorded."""
+def _zero_rate(core: Core, par: Parameters, mean: Vector, now: int) -> None:
+    """At rest the gyro shows its bias and the earth's turning: mean = bg + R' omega_ie. Gated, but not recorded.
+
+    What fails the gate is a creep along a bend; but where positions contradict the state, or did of late, its bias.
+    """
     nav, R, residual = core.nav, core.R, core.residual
     earth = matvec_t(attitude(nav), (0.0, EARTH_RATE * np.cos(nav[0]), EARTH_RATE * np.sin(nav[0])))
     clear(R)
@@ -218,3 +224,6 @@ def _zero_rate(core: Core, par: Parameters, mean: Vector) -> None:
         correct(nav, core.earth, core.P, core.W, core.dx, residual, 3)
         if len(core.tape):
             note_correction(core, 3)
+    elif in_question(core.health, par.health.settled_ns, now):
+        for i in range(3):
+            core.P[9 + i, 9 + i] += JUMPED_VAR

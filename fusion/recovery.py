@@ -48,10 +48,17 @@ def believed(core: Core, par: Parameters, which: int, z: Vector, now: int) -> No
 def _goes_on(core: Core, par: Parameters, z: Vector, now: int) -> bool:
     """Whether GNSS alone, accepted now, says what it said while it was rejected: then it is the state that gave way."""
     clock, said = core.doubt_clock, core.doubt[0]
-    if clock[0, D_COUNT] == 0 or now - clock[0, D_SINCE] < par.health.contradicted_ns or not _alone(core, now):
+    if clock[0, D_COUNT] == 0 or not _for_long(core, par, now):
         return False
     near: bool = math.hypot(z[0] - said[0], z[1] - said[1]) < 0.5 * math.hypot(said[0], said[1])
     return near
+
+
+@kernel()
+def _for_long(core: Core, par: Parameters, now: int) -> bool:
+    """Whether GNSS, alone, has contradicted the state for longer than two sensors need."""
+    lasts: bool = now - core.doubt_clock[0, D_SINCE] >= par.health.contradicted_ns
+    return lasts and _alone(core, now)
 
 
 @kernel()
@@ -106,6 +113,8 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
         elif clock[which, D_COUNT] >= par.outvoted:
             if which == 0:
                 give_way_upwards(core.P, z[2], climb)
+                if _for_long(core, par, now):  # all but the height has given way by now
+                    gave_way(core.health, par.health.settled_ns, True, now)
             else:
                 give_way_turning(core.P, z[2])
                 core.slipped[:] = 0.0  # learned with a wrong yaw, it would hold on to it

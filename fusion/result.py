@@ -92,6 +92,9 @@ class Cause(IntEnum):
     """No position was explained by the state for long."""
     TILTED = 12
     """A land vehicle on its side: the IMU's axes are others."""
+    LASTING_ERROR = 13
+    """GNSS or pose fixes are applied, but only with an error that lasts and is many of its sigmas: they contradict the
+    rest."""
 
 
 class Level(IntEnum):

@@ -21,8 +21,9 @@ TRACKING_NS = 2_000_000_000
 """The filter was tracking if a position was applied within so long before the streak."""
 ALIAS_M = 1.5
 """Nothing that looks alike on a road lies nearer: half of a narrow lane, or of the shortest pitch of dashes."""
-INSISTING = 2
-"""So many GNSS positions rejected in a row before one may be explained by a new error that lasts."""
+INSISTING_NS = 150_000_000
+"""GNSS positions have been rejected in a row for so long before one may be explained by a new error that lasts: the
+third of 10 Hz, the second of 1 Hz. One reflection is over by then; a message that comes twice insists on nothing."""
 SAME = 9.21
 """Largest squared distance, in variances, of a fix that goes on as the one before it: 99 % of two dimensions. The
 hundredth is none the less the same alias: so is what lies within ALIAS_M of it."""
@@ -36,9 +37,10 @@ def threshold_of(core: Core, par: Parameters, dof: int, now: int) -> float:
 
 
 @kernel()
-def may_renew(core: Core, which: int) -> bool:
+def may_renew(core: Core, which: int, now: int) -> bool:
     """Whether a rejected position of sensor which (0 GNSS, 1 pose fix) may be judged with a new error that lasts."""
-    may: bool = which == 1 or core.doubt_clock[0, D_STREAK] >= INSISTING
+    clock = core.doubt_clock
+    may: bool = which == 1 or (clock[0, D_STREAK] > 0 and now - clock[0, D_LAST] >= INSISTING_NS)
     return may
 
 
@@ -73,6 +75,8 @@ def tally(core: Core, par: Parameters, which: int, passed: bool, now: int) -> No
         clock[which, D_HELD] = now
         return
     if which == 0:
+        if clock[0, D_STREAK] == 0:
+            clock[0, D_LAST] = now
         clock[0, D_STREAK] += 1
         return
     same = goes_on(core, now)

@@ -14,7 +14,7 @@ from fusion.config import KERNELS, FusionConfig, check
 from fusion.covariance import Noise
 from fusion.divergence import HealthLimits
 from fusion.events import MOTION, OUTPUT, Events, Parameters
-from fusion.layout import layout_of
+from fusion.layout import Layout, layout_of
 from fusion.sensor_models import ImuNoise
 from fusion.sources import APPLY, Sources
 from sensors.vehicle import ImuSpec, Vehicle
@@ -99,12 +99,12 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
         still_max_speed=motion.still_max_speed,
         zero_velocity_var=motion.zero_velocity_sigma**2,
         zero_rate_var=float(np.radians(motion.zero_rate_sigma_deg) ** 2) + noise.gyro_psd * motion.rate_hz,
-        health=_health_limits(config, land_vehicle=vehicle.land_vehicle),
+        health=_health_limits(config, layout, land_vehicle=vehicle.land_vehicle),
         level=vehicle.land_vehicle,
     )
 
 
-def _health_limits(config: FusionConfig, *, land_vehicle: bool) -> HealthLimits:
+def _health_limits(config: FusionConfig, layout: Layout, *, land_vehicle: bool) -> HealthLimits:
     model = config.health
     first, second, third = (_chi_square(config.gates.probability, dof) for dof in (1, 2, 3))
     gnss, pose, wheel = (round(s * 1e9) for s in (model.gnss_stale_s, model.pose_stale_s, model.wheel_stale_s))
@@ -130,6 +130,8 @@ def _health_limits(config: FusionConfig, *, land_vehicle: bool) -> HealthLimits:
         wide_yaw_var=float(np.radians(model.wide_sigma_yaw_deg) ** 2),
         far_m=model.far_m,
         course_speed2=config.alignment.min_course_speed**2,
+        lasting=(layout.gnss_error, layout.pose_error),
+        lasting_sigmas=model.lasting_sigmas,
     )
 
 

@@ -128,7 +128,9 @@ def _apply_renewed(
         if lasts:
             passed = _apply(core, rec, par, k, dof, threshold, accepted)
             break
-        known = may_renew(core, int(kind == _POSE_FIX)) and innovate(core.P, core.H, core.W, dof, core.R, core.L)
+        known = may_renew(core, int(kind == _POSE_FIX), ev.t[e]) and innovate(
+            core.P, core.H, core.W, dof, core.R, core.L
+        )
         if not (known and whiten(dof, core.residual, core.L) <= threshold):
             break
         renew(core, first)

@@ -13,10 +13,12 @@ from fusion.filter import Localizer
 from fusion.health import SOURCES
 from fusion.result import Cause, FusionResult, Health, Level, Sensor
 from fusion.run import Session, joined, run
-from sensors.pieces import SENSORS
+from sensors.pieces import SENSORS, join
 from sensors.records import GnssStatus, Log
 from sensors.simulate import scenarios
 from sensors.simulate.drive import Drive, simulate_drive
+from sensors.simulate.faults.inject import Injector
+from sensors.simulate.faults.spec import parse
 from sensors.simulate.gnss import displaced
 from tests.fusion.free import Floats
 from tests.fusion.rough import LIMITS, fused_errors, off
@@ -240,10 +242,34 @@ def test_health_without_restart_is_never_well_again(drive: Drive) -> None:
     assert (result.states.cause[s > 30.0] == Cause.UNSETTLED).any()
 
 
-@pytest.mark.parametrize("made", [in_g, wandering, lambda log: with_outage(log, 40.0, 30.0)])
+@pytest.mark.parametrize("spec", ["pose-drift:mild@50+30", "gnss-drift:mild@50+30"])
+def test_two_sensors_that_drift_apart_are_told(drive: Drive, spec: str) -> None:
+    """By 3 cm a second no single position is rejected for long: what lasts of their errors takes it in."""
+    log = join(Injector(parse([spec]), 0).pieces([drive.log]))
+    result = run(log)
+    s, states = health(result, log)
+    assert np.isin(states[(s > 62.0) & (s < 80.0)], NOT_SUCCESS).all()
+    assert Cause.LASTING_ERROR in result.states.cause[(s > 62.0) & (s < 80.0)]
+    assert not (result.states.cause[s < 50.0] == Cause.LASTING_ERROR).any()
+
+
+def test_a_yaw_that_the_imu_turned_against_pose_fixes_is_told() -> None:
+    """A turn rate of the wrong sign for ten seconds of a bend; with a degree of yaw the fixes pass."""
+    drive = simulate_drive(180.0, 100_014, scenarios.load("clean"))
+    log = join(Injector(parse(["imu-axis-flip:severe@67+10"]), 100_014).pieces([drive.log]))
+    result = run(log)
+    s, states = health(result, log)
+    off_yaw = np.abs(fused_errors(result, drive)[:, 2]) > 1.0
+    assert off_yaw.sum() > 100
+    assert np.isin(states[off_yaw & (s > 75.0)], NOT_SUCCESS).all()
+
+
+@pytest.mark.parametrize(
+    "made", [in_g, lambda log: gnss_alone(wandering(log)), lambda log: gnss_alone(with_outage(log, 40.0, 30.0))]
+)
 def test_health_does_not_depend_on_the_pieces(drive: Drive, made) -> None:  # type: ignore[no-untyped-def]
     """Restarts included: random cuts give the same bits."""
-    log = gnss_alone(made(drive.log))
+    log = made(drive.log)
     whole = run(log)
     assert log.imu is not None
     for seed in range(4):

@@ -22,13 +22,6 @@ SEED = 1000
 ALL, NO_POSE = SENSOR_SETS
 RECOVERS_S = {ALL: 20.0, NO_POSE: 40.0}
 """After the fault's end, s. GNSS alone shows a yaw that is a degree off only where the vehicle turns or speeds up."""
-NEVER_BACK = {
-    (
-        "imu-gyro-bias",
-        NO_POSE,
-    ): "at a stand GNSS alone widens no yaw, where it goes on slowly its course does not show it"
-}
-"""Fault and set of sensors -> why the state is lost to the drive's end; it says so."""
 SILENT = {("gnss-drift", NO_POSE): "a lone receiver that drifts by 0.1 m/s is followed: nothing says that it is wrong"}
 """Fault and set of sensors -> why the states are said to be healthy."""
 
@@ -41,15 +34,7 @@ def drives() -> dict[str, Subject]:
 CASES = [(name, sensors) for name, fault in FAULTS.items() for sensors in SENSOR_SETS if acts_on(fault, sensors)]
 
 
-@pytest.mark.parametrize(
-    ("name", "sensors"),
-    [
-        pytest.param(*case, marks=pytest.mark.xfail(strict=True, reason=NEVER_BACK[case]))
-        if case in NEVER_BACK
-        else case
-        for case in CASES
-    ],
-)
+@pytest.mark.parametrize(("name", "sensors"), CASES)
 def test_a_fault_is_survived(name: str, sensors: str, drives: dict[str, Subject]) -> None:
     found = medium(drives[sensors], name)
     assert found.recover_s is not None
