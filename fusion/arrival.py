@@ -40,6 +40,7 @@ from fusion.snapshots import S_FIRST, S_NEWEST, restore, snapshot_before
 from fusion.state import C_COUNT, C_SAMPLE, C_STATE, Core, Floats, Nanoseconds
 from fusion.update import record_decision
 from sensors.kernel import kernel
+from sensors.reference import by_reference
 
 FOREVER = 2**63 - 1
 """After any stamp."""
@@ -70,6 +71,24 @@ def arrive(
     given up: at a position that finds it hopeless it stays, with the samples that had arrived by then in the ring and
     the events not met in the history; nothing else is taken.
     """
+    taken = _take(by_reference(core), by_reference(history), imu_t, gyro, accel, imu_due, count, by_reference(par), by_reference(rec), stamps)
+    return taken
+
+
+@kernel(inline="always")
+def _take(
+    core: Core,
+    history: History,
+    imu_t: Nanoseconds,
+    gyro: Floats,
+    accel: Floats,
+    imu_due: Nanoseconds,
+    count: int,
+    par: Parameters,
+    rec: Recorder,
+    stamps: Nanoseconds,
+) -> tuple[int, int, bool]:
+    """The loop itself, on references."""
     mark, inbox, samples = history.mark, history.inbox, len(imu_t)
     i = j = 0
     while i < samples or j < count:
@@ -143,7 +162,7 @@ def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: 
     """Run the ring's samples after the state, with the events up to the last of them."""
     mark, played, every, size = history.mark, history.played, history.events, len(core.ring_t)
     first, decided, n = mark[M_NEXT], rec.filled[1], mark[M_EVENTS]
-    events = Events(every.t[:n], every.kind[:n], every.row[:n], every.verdict[:n])
+    events = by_reference(Events(every.t[:n], every.kind[:n], every.row[:n], every.verdict[:n]))
     met = first
     while core.clock[C_COUNT] < mark[M_SAMPLES]:
         begin = core.clock[C_COUNT] & (size - 1)

@@ -33,7 +33,7 @@ def kernel(*, allocates: bool = False, **options: Any) -> Callable[[Callable[...
         before = numba.config.CACHE_DIR
         numba.config.CACHE_DIR = str(cache_folder())
         try:
-            return numba.njit(cache=True, _nrt=allocates, **options)(function)
+            return numba.njit(cache=True, _nrt=allocates, no_cfunc_wrapper=True, **options)(function)
         finally:
             numba.config.CACHE_DIR = before
 
