@@ -46,8 +46,8 @@ def process(
     Events lie at or after the state's time. Between two samples the signals are curves, so an event is met at its own
     time, not at a sample's.
     """
-    shared = by_reference(core), by_reference(ev), by_reference(m), by_reference(par), by_reference(rec)
-    reached: int = sweep(shared[0], imu_t, gyro, accel, shared[1], first_event, shared[2], shared[3], shared[4], False)
+    core, ev, m, par, rec = by_reference(core), by_reference(ev), by_reference(m), by_reference(par), by_reference(rec)
+    reached: int = sweep(core, imu_t, gyro, accel, ev, first_event, m, par, rec, False)
     return reached
 
 

@@ -71,24 +71,7 @@ def arrive(
     given up: at a position that finds it hopeless it stays, with the samples that had arrived by then in the ring and
     the events not met in the history; nothing else is taken.
     """
-    taken = _take(by_reference(core), by_reference(history), imu_t, gyro, accel, imu_due, count, by_reference(par), by_reference(rec), stamps)
-    return taken
-
-
-@kernel(inline="always")
-def _take(
-    core: Core,
-    history: History,
-    imu_t: Nanoseconds,
-    gyro: Floats,
-    accel: Floats,
-    imu_due: Nanoseconds,
-    count: int,
-    par: Parameters,
-    rec: Recorder,
-    stamps: Nanoseconds,
-) -> tuple[int, int, bool]:
-    """The loop itself, on references."""
+    core, history, par, rec = by_reference(core), by_reference(history), by_reference(par), by_reference(rec)
     mark, inbox, samples = history.mark, history.inbox, len(imu_t)
     i = j = 0
     while i < samples or j < count:
@@ -138,7 +121,7 @@ def _load(history: History, t: int, gyro: Floats, accel: Floats, row: int) -> No
         ring.gyro[k, axis], ring.accel[k, axis] = gyro[row, axis], accel[row, axis]
 
 
-@kernel(inline="always")
+@kernel()
 def _lay_grid(core: Core, history: History, rec: Recorder, stamps: Nanoseconds, last: int) -> None:
     """Lay out motion ticks and outputs up to the last IMU sample."""
     mark = history.mark
@@ -157,7 +140,7 @@ def _lay_grid(core: Core, history: History, rec: Recorder, stamps: Nanoseconds, 
             mark[M_OUTPUT] += mark[M_OUTPUT_PERIOD]
 
 
-@kernel(inline="always")
+@kernel()
 def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: Nanoseconds) -> None:
     """Run the ring's samples after the state, with the events up to the last of them."""
     mark, played, every, size = history.mark, history.played, history.events, len(core.ring_t)
@@ -182,7 +165,7 @@ def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: 
             _remove(history, e, 1)
 
 
-@kernel(inline="always")
+@kernel()
 def _admit(core: Core, history: History, j: int, rec: Recorder, stamps: Nanoseconds) -> int:
     """Line measurement j of the inbox up among the events; the time to rewind to for it, FOREVER if there is no need.
 
@@ -208,7 +191,7 @@ def _admit(core: Core, history: History, j: int, rec: Recorder, stamps: Nanoseco
     return FOREVER
 
 
-@kernel(inline="always")
+@kernel()
 def _rewind(core: Core, history: History, t: int) -> None:
     """Go back to time t or before; the events from there on are the next to be met."""
     number = snapshot_before(core, history.mark[M_SAMPLES], t)
@@ -219,7 +202,7 @@ def _rewind(core: Core, history: History, t: int) -> None:
     history.mark[M_NEXT] = e
 
 
-@kernel(inline="always")
+@kernel()
 def _insert(history: History, t: int, kind: int, row: int, verdict: int, arrival: int, log_row: int) -> bool:
     """Put an event in its place by time and kind; False: there is one already."""
     events, n = history.events, history.mark[M_EVENTS]
@@ -244,7 +227,7 @@ def _move(history: History, source: int, target: int) -> None:
     history.arrival_ns[target], history.log_row[target] = history.arrival_ns[source], history.log_row[source]
 
 
-@kernel(inline="always")
+@kernel()
 def _remove(history: History, first: int, count: int) -> None:
     """Forget events from the first on, all of them met."""
     mark = history.mark
