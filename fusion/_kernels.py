@@ -18,6 +18,7 @@ from fusion.tape import note_coast
 from fusion.update import age, gives_up, handle, move
 from sensors._kernels import radii
 from sensors.kernel import kernel
+from sensors.reference import by_reference
 
 Interval = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 """Rates at both ends of an IMU interval, forces at both ends, and the bend of each (coefficient of x^2 - x)."""
@@ -45,6 +46,7 @@ def process(
     Events lie at or after the state's time. Between two samples the signals are curves, so an event is met at its own
     time, not at a sample's.
     """
+    core, ev, m, par, rec = by_reference(core), by_reference(ev), by_reference(m), by_reference(par), by_reference(rec)
     reached: int = sweep(core, imu_t, gyro, accel, ev, first_event, m, par, rec, False)
     return reached
 

@@ -41,8 +41,9 @@ from fusion.result import Reason
 from fusion.snapshots import S_FIRST, S_NEWEST, restore, snapshot_before
 from fusion.state import C_COUNT, C_SAMPLE, C_STATE, FOREVER, Core, Floats, Nanoseconds
 from fusion.update import record_decision
-from sensors.held import Held, read
+from sensors.held import Held, refer
 from sensors.kernel import kernel
+from sensors.reference import by_reference
 
 _APPLY = -1
 _BEFORE_ALIGNMENT = int(Reason.BEFORE_ALIGNMENT)
@@ -76,7 +77,8 @@ def arrive(
     measurements were taken, and whether the filter has given up: at a position that finds it hopeless it stays, with
     the samples that had arrived by then in the ring and the events not met in the history; nothing else is taken.
     """
-    core, history, par, rec, stamps = read(desk)
+    at = refer(desk)
+    core, history, par, rec, stamps = at.core, at.history, at.par, at.rec, at.stamps
     mark, inbox, samples = history.mark, history.inbox, len(imu_t)
     i = j = 0
     while i < samples or j < count:
@@ -126,7 +128,7 @@ def _load(history: History, t: int, gyro: Floats, accel: Floats, row: int) -> No
         ring.gyro[k, axis], ring.accel[k, axis] = gyro[row, axis], accel[row, axis]
 
 
-@kernel(inline="always")
+@kernel()
 def _lay_grid(core: Core, history: History, rec: Recorder, stamps: Nanoseconds, last: int) -> None:
     """Lay out motion ticks and outputs up to the last IMU sample."""
     mark = history.mark
@@ -145,12 +147,12 @@ def _lay_grid(core: Core, history: History, rec: Recorder, stamps: Nanoseconds, 
             mark[M_OUTPUT] += mark[M_OUTPUT_PERIOD]
 
 
-@kernel(inline="always")
+@kernel()
 def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: Nanoseconds) -> None:
     """Run the ring's samples after the state, with the events up to the last of them."""
     mark, played, every, size = history.mark, history.played, history.events, len(core.ring_t)
     first, decided, n = mark[M_NEXT], rec.filled[1], mark[M_EVENTS]
-    events = Events(every.t[:n], every.kind[:n], every.row[:n], every.verdict[:n])
+    events = by_reference(Events(every.t[:n], every.kind[:n], every.row[:n], every.verdict[:n]))
     met = first
     while core.clock[C_COUNT] < mark[M_SAMPLES]:
         begin = core.clock[C_COUNT] & (size - 1)
@@ -170,7 +172,7 @@ def _play(core: Core, history: History, par: Parameters, rec: Recorder, stamps: 
             _remove(history, e, 1)
 
 
-@kernel(inline="always")
+@kernel()
 def _admit(core: Core, history: History, j: int, rec: Recorder, stamps: Nanoseconds) -> int:
     """Line measurement j of the inbox up among the events; the time to rewind to for it, FOREVER if there is no need.
 
@@ -196,7 +198,7 @@ def _admit(core: Core, history: History, j: int, rec: Recorder, stamps: Nanoseco
     return FOREVER
 
 
-@kernel(inline="always")
+@kernel()
 def _rewind(core: Core, history: History, t: int) -> None:
     """Go back to time t or before; the events from there on are the next to be met."""
     number = snapshot_before(core, history.mark[M_SAMPLES], t)
@@ -207,7 +209,7 @@ def _rewind(core: Core, history: History, t: int) -> None:
     history.mark[M_NEXT] = e
 
 
-@kernel(inline="always")
+@kernel()
 def _insert(history: History, t: int, kind: int, row: int, verdict: int, arrival: int, log_row: int) -> bool:
     """Put an event in its place by time and kind; False: there is one already."""
     events, n = history.events, history.mark[M_EVENTS]
@@ -232,7 +234,7 @@ def _move(history: History, source: int, target: int) -> None:
     history.arrival_ns[target], history.log_row[target] = history.arrival_ns[source], history.log_row[source]
 
 
-@kernel(inline="always")
+@kernel()
 def _remove(history: History, first: int, count: int) -> None:
     """Forget events from the first on, all of them met."""
     mark = history.mark

@@ -15,6 +15,8 @@ from sensors.kernel import kernel
 
 _ZERO_VELOCITY = int(Sensor.ZERO_VELOCITY)
 _NON_HOLONOMIC = int(Sensor.NON_HOLONOMIC)
+_AXES = np.int64(3)
+"""Not a literal, for which numba would compile the update a second time."""
 
 QUIETEST_FORCE = 0.003
 """No IMU rests quieter than this (a stuck one does), m/s^2."""
@@ -220,10 +222,10 @@ def _zero_rate(core: Core, par: Parameters, mean: Vector, now: int) -> None:
         core.H[i, 9 + i] = 1.0
         R[i, i] = par.zero_rate_var
         residual[i] = mean[i] - earth[i] - nav[10 + i]
-    if innovate(core.P, core.H, core.W, 3, R, core.L) and whiten(3, residual, core.L) <= par.gate[2]:
-        correct(nav, core.earth, core.P, core.W, core.dx, residual, 3)
+    if innovate(core.P, core.H, core.W, _AXES, R, core.L) and whiten(_AXES, residual, core.L) <= par.gate[2]:
+        correct(nav, core.earth, core.P, core.W, core.dx, residual, _AXES)
         if len(core.tape):
-            note_correction(core, 3)
+            note_correction(core, _AXES)
     elif in_question(core.health, par.health.settled_ns, now):
         for i in range(3):
             core.P[9 + i, 9 + i] += JUMPED_VAR

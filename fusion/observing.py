@@ -23,7 +23,7 @@ SMOOTHED_NS = 200_000_000
 """Over so long it is averaged."""
 
 
-@kernel(inline="always")
+@kernel()
 def measure(
     core: Core, par: Parameters, m: Measurements, kind: int, row: int, rate: Vector, lasts: bool
 ) -> tuple[int, int]:

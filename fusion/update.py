@@ -29,6 +29,8 @@ _CHI_SQUARE = int(Reason.CHI_SQUARE)
 _RECEIVER = int(Reason.RECEIVER)
 _MODES_AGREE = int(Reason.MODES_AGREE)
 _SOURCES = len(SOURCES)
+_LASTS = np.bool_(True)
+"""Not a literal, for which numba would compile a second ``measure``."""
 
 
 @kernel(inline="always")
@@ -70,7 +72,7 @@ def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Even
         noted(core.health, core.trust, par.health.suspect, kind, False, False, ev.t[e])
         return
     else:
-        dof, accepted = measure(core, par, m, kind, ev.row[e], rate, True)
+        dof, accepted = measure(core, par, m, kind, ev.row[e], rate, _LASTS)
         if dof == 0:
             record_decision(rec, e, kind, 0, accepted)
             return
@@ -137,7 +139,7 @@ def _apply_renewed(
     return passed, dof, accepted
 
 
-@kernel(inline="always")
+@kernel()
 def _apply(core: Core, rec: Recorder, par: Parameters, k: int, dof: int, threshold: float, accepted: int) -> bool:
     """Gate the core's residual and correct the state; complete decision k. Whether it passed."""
     L, residual = core.L, core.residual
@@ -172,7 +174,7 @@ def _apply(core: Core, rec: Recorder, par: Parameters, k: int, dof: int, thresho
     return True
 
 
-@kernel(inline="always")
+@kernel()
 def record_decision(rec: Recorder, event: int, sensor: int, dof: int, reason: int) -> int:
     """Open a decision; returns its row."""
     k = int(rec.filled[1])
@@ -213,7 +215,7 @@ def record_state(core: Core, rec: Recorder, t: int) -> None:
             rec.pose_cov[k, i, j] = P[a, b]
 
 
-@kernel(inline="always")
+@kernel()
 def move(core: Core, par: Parameters) -> None:
     """Bring P up to the state's time."""
     span = core.span[0]

@@ -1,7 +1,7 @@
 """Arguments of a kernel that stay the same from call to call, taken apart once.
 
 numba takes a tuple of arrays apart at every call, a tenth of a microsecond and more for each array. ``Held`` does it
-once, and a kernel reads the result (``read``): for calls that are many and short.
+once, and a kernel refers to the result (``sensors.reference``): for calls that are many and short.
 """
 
 from typing import Any, Generic, TypeVar
@@ -12,12 +12,13 @@ from numba.core import types
 from numba.extending import NativeValue, intrinsic, models, register_model, typeof_impl, unbox
 
 from sensors.kernel import kernel
+from sensors.reference import Reference
 
 Value = TypeVar("Value")
 
 
 class Held(Generic[Value]):
-    """A tuple of numbers, arrays and tuples of them, as kernels see it: its arrays can be written to."""
+    """A named tuple of numbers, arrays and named tuples, as kernels see it: its arrays can be written to."""
 
     def __init__(self, value: Value) -> None:
         self.value = value
@@ -54,14 +55,13 @@ def _unbox(kind: HeldType, held: Any, compiling: Any) -> NativeValue:
 
 
 @intrinsic  # type: ignore[untyped-decorator]
-def read(typing: Any, held: Any) -> Any:
-    """The value that is held. Within a kernel."""
+def refer(typing: Any, held: Any) -> Any:
+    """The named tuple that is held, by reference. Within a kernel."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = builder.bitcast(arguments[0], context.get_data_type(held.value).as_pointer())
-        return context.unpack_value(builder, held.value, pointer)
+        return arguments[0]
 
-    return (held.value(held), generate) if isinstance(held, HeldType) else None
+    return (Reference(held.value)(held), generate) if isinstance(held, HeldType) else None
 
 
 @intrinsic  # type: ignore[untyped-decorator]

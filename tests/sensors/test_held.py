@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sensors.held import Held, read
+from sensors.held import Held, refer
 from sensors.kernel import kernel
 
 
@@ -22,7 +22,7 @@ class Outer(NamedTuple):
 
 @kernel()
 def _summed(held: Held[Outer], factor: float) -> float:
-    outer = read(held)
+    outer = refer(held)
     outer.inner.row[0] += factor
     total: float = outer.inner.row.sum() + outer.inner.count + outer.sizes[0] + outer.sizes[1] + outer.codes[-1]
     return total
