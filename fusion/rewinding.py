@@ -81,7 +81,7 @@ class RewindingNavigator(Navigator):
         """Of each sensor, the newest measurement that alignment has had."""
         self._history: History | None = None
         self._columns: Measurements
-        self._journal = Journal(self._states, self._decisions, kept)
+        self._journal = Journal(self._states, self._decisions, kept, self._par.axes_var)
 
     def add(self, piece: Log) -> None:
         """Take the measurements and IMU samples of a piece; nothing is decided yet.
