@@ -46,6 +46,9 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Sigma of that scale error before anything is known of it, ppm."""
     gyro_misalignment_sigma_deg: NonNegative = 0.2
     """The same of the misalignment, deg."""
+    gyro_misalignment_from_deg: NonNegative = 0.05
+    """The vehicle's IMU: from here on its gyro's misalignment is estimated in any case; a smaller one harms nothing but
+    roll and pitch themselves, and is added to what is stated of them, deg."""
     mounting: bool = False
     """Pitch and yaw of the vehicle's axes against the body's, which the non-holonomic constraint needs."""
     mounting_sigma_deg: Positive = 1.0

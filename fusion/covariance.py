@@ -4,6 +4,7 @@ Between two uses of P (a measurement, a recorded state) the transition Phi is ac
 and the attitude, as in preintegration; P' = Phi P Phi' + Q costs one product per use instead of one per IMU sample.
 """
 
+import math
 from typing import NamedTuple
 
 from fusion._linalg import Matrix, Vector, cross
@@ -37,6 +38,8 @@ class Noise(NamedTuple):
     """Where the gyro's scale stands in the error state (``fusion.layout``)."""
     gyro_misalignment: int = -1
     """The same of its misalignment."""
+    velocity_per_change: float = 0.0
+    """Growth of each horizontal velocity's variance with its change (the accelerometer's scale), (m/s)^2 per m/s."""
 
 
 @kernel()
@@ -178,6 +181,9 @@ def _add_noise(P: Floats, acc: Floats, noise: Noise, span: float) -> None:
         P[9 + i, 9 + i] += noise.gyro_bias_rate * span
         P[12 + i, 12 + i] += noise.accel_bias_rate * span
     P[E_WHEEL_SCALE, E_WHEEL_SCALE] += noise.wheel_scale_rate * span
+    changed = noise.velocity_per_change * math.sqrt(acc[A_S, 0] * acc[A_S, 0] + acc[A_S, 1] * acc[A_S, 1])
+    P[3, 3] += changed
+    P[4, 4] += changed
     # velocity against attitude: -[s]x qg / 2
     half = 0.5 * qg
     x, y, z = half * acc[A_S, 0], half * acc[A_S, 1], half * acc[A_S, 2]

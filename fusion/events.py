@@ -24,6 +24,8 @@ class Parameters(NamedTuple):
 
     noise: Noise
     layout: Layout
+    axes_var: float
+    """Of the gyro's vertical axis against the body's, each way, rad^2 (``fusion.axes``)."""
     gnss_shares: tuple[float, float]
     """Of a position's variance, which may be white and which may last."""
     pose_shares: tuple[float, float]
@@ -116,7 +118,8 @@ class Recorder(NamedTuple):
 
     States: t (N,), nav (N, 16) and sigma_state (N, 15) without the wheel scale, pose_cov (N, 6, 6), health (N, 2) int8:
     Health and Cause, levels (N, 5) int8. Decisions: event (M,) index of the event; sensor, reason, dof (M,) int8;
-    innovation, sigma (M, 3); scores (M, 5): NIS, threshold, metres moved, yaw moved, weight.
+    innovation, sigma (M, 3); scores (M, 5): NIS, threshold, metres moved, yaw moved, weight. axes_var: of
+    Parameters.
     """
 
     filled: NDArray[np.int64]
@@ -133,9 +136,10 @@ class Recorder(NamedTuple):
     innovation: Floats
     sigma: Floats
     scores: Floats
+    axes_var: float
 
 
-def new_recorder(states: int, decided: int) -> Recorder:
+def new_recorder(states: int, decided: int, axes_var: float = 0.0) -> Recorder:
     """Empty output arrays for so many states and decisions."""
     return Recorder(
         filled=np.zeros(2, np.int64),
@@ -152,4 +156,5 @@ def new_recorder(states: int, decided: int) -> Recorder:
         innovation=np.empty((decided, 3)),
         sigma=np.empty((decided, 3)),
         scores=np.empty((decided, 5)),
+        axes_var=axes_var,
     )

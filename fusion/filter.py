@@ -7,6 +7,7 @@ applied.
 
 from typing import NamedTuple
 
+from fusion.axes import with_lean
 from fusion.calibration import estimates
 from fusion.config import FusionConfig
 from fusion.covariance import propagate
@@ -54,7 +55,7 @@ class Localizer:
     ) -> None:
         vehicle, config = vehicle or Vehicle(), config or FusionConfig()
         self._vehicle, self._config = vehicle, config
-        self._noise = parameters(vehicle, config).noise
+        self._par = parameters(vehicle, config)
         self._navigator: Navigator
         if config.order == "arrival":
             self._navigator = RewindingNavigator(vehicle, map_frame, config, _KEPT)
@@ -92,8 +93,9 @@ class Localizer:
         if core is None:
             return None
         P, scratch = core.P.copy(), (core.phi, core.M, core.Mt)
-        propagate(core.nav, core.earth, P, core.acc.copy(), core.span.copy(), scratch, self._noise)
-        return P[: self._navigator.state_count, : self._navigator.state_count]
+        propagate(core.nav, core.earth, P, core.acc.copy(), core.span.copy(), scratch, self._par.noise)
+        n = self._navigator.state_count
+        return with_lean(P[:n, :n], core.nav, self._par.axes_var)
 
     def take_restarts(self) -> tuple[Restart, ...]:
         """Divergences since the last call after which alignment began anew."""

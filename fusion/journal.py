@@ -19,9 +19,12 @@ _ROWS = 1024
 class Journal:
     """A recorder with room for the next call; a full one is emptied into lists."""
 
-    def __init__(self, known: list[States], made: list[Decisions], kept: int | None) -> None:
-        """known, made: where states and decisions go; kept: so many are kept there, or a few more (None: all)."""
-        self._states, self._decisions, self._kept = known, made, kept
+    def __init__(self, known: list[States], made: list[Decisions], kept: int | None, axes_var: float) -> None:
+        """known, made: where states and decisions go; kept: so many are kept there, or a few more (None: all).
+
+        axes_var: as in ``fusion.events.Parameters``.
+        """
+        self._states, self._decisions, self._kept, self._axes_var = known, made, kept, axes_var
         self._recorder: Recorder | None = None
         self.stamps: Nanoseconds = np.zeros((0, 3), np.int64)
         """(M, 3): time, arrival and log row of the recorder's decisions."""
@@ -34,7 +37,7 @@ class Journal:
         self.flush()
         if rec is not None and self._recorder is rec and recorded <= len(rec.t) and made <= len(rec.event):
             return rec
-        self._recorder = rec = new_recorder(max(recorded, _ROWS), max(made, _ROWS))
+        self._recorder = rec = new_recorder(max(recorded, _ROWS), max(made, _ROWS), self._axes_var)
         self.stamps = np.zeros((len(rec.event), 3), np.int64)
         return rec
 

@@ -72,13 +72,16 @@ def _priors(vehicle: Vehicle, config: FusionConfig) -> dict[str, float]:
     """Sigma of each block's states; zero for a block that is not there."""
     gnss, pose, estimate = config.gnss, config.pose, config.estimate
     scale, skew = (estimate.gyro_scale_sigma_ppm, estimate.gyro_misalignment_sigma_deg) if estimate.gyro else (0.0, 0.0)
+    known = vehicle.imu.gyro_misalignment_deg
+    if not estimate.gyro and known < estimate.gyro_misalignment_from_deg:
+        known = 0.0
     arm = (vehicle.gnss_lever_arm_sigma_m or estimate.lever_arm_sigma_m) if estimate.lever_arm else 0.0
     return {
         "gnss_error": float(gnss.use and gnss.lasting_share > 0.0),
         "pose_error": float(pose.use and pose.lasting_share > 0.0),
         "pose_yaw": math.radians(pose.yaw_offset_sigma_deg) if pose.use else 0.0,
         "gyro_scale": 1e-6 * (vehicle.imu.gyro_scale_ppm or scale),
-        "gyro_misalignment": math.radians(vehicle.imu.gyro_misalignment_deg or skew),
+        "gyro_misalignment": math.radians(known or skew),
         "gnss_arm": arm if gnss.use else 0.0,
         "mounting": math.radians(estimate.mounting_sigma_deg) if estimate.mounting and vehicle.land_vehicle else 0.0,
         "gnss_delay": estimate.delay_sigma_s if gnss.use and estimate.gnss_delay else 0.0,

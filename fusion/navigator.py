@@ -46,6 +46,8 @@ class Navigator:
         self.state_count = used(self._par.layout)
         self._aligner = self._new_aligner()
         self._tape = tape
+        if tape is not None:
+            tape.axes_var = self._par.axes_var
         self._kept_ns = round((config.alignment.window_s + kept_s) * NS_PER_S)
         self._rows = dict.fromkeys(RECORDS, 0)
         self._imu: list[Imu] = []
@@ -179,7 +181,7 @@ class Navigator:
         timeline = merge(found, now + 1, last, self._config, self._empty.vehicle.land_vehicle)
         events = timeline.events
         outputs = int((events.kind == OUTPUT).sum())
-        recorder = new_recorder(outputs, len(events.t) - outputs)
+        recorder = new_recorder(outputs, len(events.t) - outputs, self._par.axes_var)
         done = feed(core, imu, events, found.measurements, self._par, recorder, self._tape)
         if outputs:
             self._states.append(states(recorder))

@@ -85,7 +85,7 @@ class RewindingNavigator(Navigator):
         self._history: History | None = None
         self._desk: Held[Desk] | None = None
         self._columns: Measurements
-        self._journal = Journal(self._states, self._decisions, kept)
+        self._journal = Journal(self._states, self._decisions, kept, self._par.axes_var)
 
     def add(self, piece: Log) -> None:
         """Take the measurements and IMU samples of a piece; nothing is decided yet.

@@ -206,7 +206,7 @@ def smoothed(tape: Tape) -> Iterator[States]:
     for numbers, outputs, size in reversed(tape):
         if not len(held):
             core, held, work = new_core(size), np.zeros((2 * size + 4, size)), np.zeros((2 * size + 4, size))
-        recorder = new_recorder(outputs, 0)
+        recorder = new_recorder(outputs, 0, tape.axes_var)
         retrace(numbers, core, held, count, work, recorder)
         part = states(recorder)
         found.append(*(np.ascontiguousarray(getattr(part, f.name)[::-1]) for f in fields(part)))

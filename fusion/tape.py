@@ -127,6 +127,8 @@ class Tape:
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder
+        self.axes_var = 0.0
+        """As in ``fusion.events.Parameters``, for the smoothed states."""
         self._file = Spool(folder)
         self._buffer: Floats = np.empty(0)
         self._end = np.zeros(1, np.int64)

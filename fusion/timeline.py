@@ -14,7 +14,7 @@ from fusion.config import KERNELS, FusionConfig, check
 from fusion.covariance import Noise
 from fusion.divergence import HealthLimits
 from fusion.events import MOTION, OUTPUT, Events, Parameters
-from fusion.layout import Layout, layout_of
+from fusion.layout import OFF, Layout, layout_of
 from fusion.sensor_models import ImuNoise
 from fusion.sources import APPLY, Sources
 from sensors.vehicle import ImuSpec, Vehicle
@@ -24,6 +24,9 @@ STANDARD_GRAVITY = 9.80665
 _ROOT_HOUR = 60.0
 _DEG_PER_H = math.pi / 180.0 / 3600.0
 _MILLI_G = 1e-3 * STANDARD_GRAVITY
+_CHANGE = 10.0
+"""By so much a manoeuvre changes the velocity (a stop, a corner), m/s: of a share e of it, which the accelerometer
+misses, the variance is e^2 times its square; as a walk along the change that is this times e^2 for each m/s."""
 
 
 def noise_of(spec: ImuSpec, model: ImuNoise, wheel_scale_walk: float = 0.0) -> Noise:
@@ -34,6 +37,7 @@ def noise_of(spec: ImuSpec, model: ImuNoise, wheel_scale_walk: float = 0.0) -> N
     accel_bias_var = (spec.accel_bias_instability_mg * _MILLI_G) ** 2
     gyro_warmth = spec.gyro_bias_deg_per_h_per_k * _DEG_PER_H * model.temperature_walk_k
     accel_warmth = spec.accel_bias_mg_per_k * _MILLI_G * model.temperature_walk_k
+    accel_share_var = (1e-6 * spec.accel_scale_ppm) ** 2 + math.radians(spec.accel_misalignment_deg) ** 2
     decay = 2.0 / spec.bias_time_constant_s
     return Noise(
         gyro_psd=gyro**2,
@@ -42,6 +46,7 @@ def noise_of(spec: ImuSpec, model: ImuNoise, wheel_scale_walk: float = 0.0) -> N
         gyro_bias_rate=gyro_bias_var * decay + gyro_warmth**2,
         accel_bias_rate=accel_bias_var * decay + accel_warmth**2,
         wheel_scale_rate=wheel_scale_walk**2 / 3600.0,
+        velocity_per_change=accel_share_var * _CHANGE,
     )
 
 
@@ -57,6 +62,7 @@ def parameters(vehicle: Vehicle, config: FusionConfig) -> Parameters:
     return Parameters(
         noise=noise,
         layout=layout,
+        axes_var=math.radians(vehicle.imu.gyro_misalignment_deg) ** 2 if layout.gyro_misalignment == OFF else 0.0,
         gnss_rate=1.0 / config.gnss.lasting_s,
         pose_per_m=1.0 / pose.lasting_m,
         gnss_shares=(config.gnss.white_share, config.gnss.lasting_share),

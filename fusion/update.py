@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from fusion._linalg import Vector, attitude
+from fusion.axes import add_lean
 from fusion.blocks import renew
 from fusion.covariance import propagate
 from fusion.events import MOTION, OUTPUT, Events, Measurements, Parameters, Recorder
@@ -213,6 +214,8 @@ def record_state(core: Core, rec: Recorder, t: int) -> None:
         for j in range(6):
             b = j if j < 3 else j + 3
             rec.pose_cov[k, i, j] = P[a, b]
+    if rec.axes_var > 0.0:
+        add_lean(core.nav, rec.axes_var, rec.sigma_state[k], rec.pose_cov[k])
 
 
 @kernel()

@@ -26,7 +26,11 @@ class ImuSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gyro_scale_ppm: NonNegative = 0.0
     """Standard deviation of the gyro's scale error about the vertical axis: a state; 0: none, ppm."""
     gyro_misalignment_deg: NonNegative = 0.0
-    """Standard deviation of how far its other axes see the yaw rate: states beside the scale error, deg."""
+    """Standard deviation of how far its other axes see the yaw rate, deg."""
+    accel_scale_ppm: NonNegative = 0.0
+    """Standard deviation of the accelerometer's scale error, ppm."""
+    accel_misalignment_deg: NonNegative = 0.0
+    """Standard deviation of how far its axes see the acceleration along the others, deg."""
     gyro_bias_deg_per_h_per_k: NonNegative = 0.0
     """How the gyro bias changes with temperature (standard deviation), deg/h/K."""
     accel_bias_mg_per_k: NonNegative = 0.0

@@ -17,6 +17,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
+from fusion.axes import with_lean
 from fusion.config import FusionConfig
 from fusion.navigator import Navigator
 from fusion.sensor_models import GnssModel, ImuNoise, MotionModel, PoseModel
@@ -33,6 +34,7 @@ from fusion.state import (
     QUATERNION,
     VELOCITY,
 )
+from fusion.timeline import parameters
 from replay.bench.measure import conditions, row
 from replay.table import bare_table
 from sensors.clock import NS_PER_S
@@ -165,7 +167,8 @@ def nees(drive: Drive, config: FusionConfig) -> dict[str, Floats]:
     epochs = seconds * NS_PER_S
     navigator = Navigator(log.vehicle, log.map_frame, config)
     navigator.add(log)
-    states = [_state_at(navigator, int(t_ns)) for t_ns in epochs]
+    axes_var = parameters(log.vehicle, config).axes_var
+    states = [_state_at(navigator, int(t_ns), axes_var) for t_ns in epochs]
     scores = {block: np.full(len(epochs), np.nan) for block in BLOCKS}
     known = np.array([state is not None for state in states])
     if not known.any():
@@ -179,15 +182,15 @@ def nees(drive: Drive, config: FusionConfig) -> dict[str, Floats]:
     return scores
 
 
-def _state_at(navigator: Navigator, t_ns: int) -> tuple[Floats, Floats] | None:
-    """nav and P after everything up to a time on the output grid; None: not aligned."""
+def _state_at(navigator: Navigator, t_ns: int, axes_var: float) -> tuple[Floats, Floats] | None:
+    """nav and P, as it is stated, after everything up to a time on the output grid; None: not aligned."""
     navigator.advance(t_ns)
     navigator.take_states()
     core = navigator.core
     if core is None or core.clock[C_STATE] != t_ns:
         return None
     assert core.span[0] == 0.0  # P belongs to the state
-    return core.nav.copy(), core.P.copy()
+    return core.nav.copy(), with_lean(core.P, core.nav, axes_var)
 
 
 def _errors(drive: Drive, t_ns: NDArray[np.int64], nav: Floats) -> Floats:

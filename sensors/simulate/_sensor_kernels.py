@@ -33,12 +33,14 @@ def add_inertial_errors(
     bias_nodes: Floats,
     gain_nodes: Floats,
     axes: Floats,
+    rest: float,
     sigma: float,
     white: Floats,
 ) -> None:
     """Errors of one triad, in place: samples (N, 3) become gain (axes samples) + bias + sigma white (N, 3).
 
-    at: (N,) place between the nodes; bias_nodes, gain_nodes: (K, 3), interpolated; biases: (N, 3), written.
+    at: (N,) place between the nodes; bias_nodes, gain_nodes: (K, 3), interpolated; biases: (N, 3), written: what
+    a sample is off at rest on level ground, where the third axis sees `rest`.
     """
     last = len(bias_nodes) - 2
     for i in range(len(samples)):
@@ -48,7 +50,7 @@ def add_inertial_errors(
         for c in range(3):
             bias = bias_nodes[k, c] + share * (bias_nodes[k + 1, c] - bias_nodes[k, c])
             gain = gain_nodes[k, c] + share * (gain_nodes[k + 1, c] - gain_nodes[k, c])
-            biases[i, c] = bias
+            biases[i, c] = bias + rest * (gain * axes[c, 2] - (1.0 if c == 2 else 0.0))
             samples[i, c] = gain * (axes[c, 0] * x + axes[c, 1] * y + axes[c, 2] * z) + bias + sigma * white[i, c]
 
 

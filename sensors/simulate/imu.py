@@ -90,18 +90,23 @@ class ImuSimulation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuBiases:
-    """True biases at the IMU's stamps (sample = truth + bias + noise). gyro: (N, 3) rad/s; accel: (N, 3) m/s^2."""
+    """True biases at the IMU's stamps: sample = truth + bias + noise at rest on level ground, and everywhere without
+    flaws. What scale and misalignment make of gravity is constant, and part of the accelerometer's bias: no filter
+    that has no states for these can tell it apart. gyro: (N, 3) rad/s; accel: (N, 3) m/s^2.
+    """
 
     gyro: Floats
     accel: Floats
 
 
 class _Triad(NamedTuple):
-    """Errors of three axes over a drive: bias and gain (K, 3) at nodes, axes (3, 3), white noise of each sample."""
+    """Errors of three axes over a drive: bias and gain (K, 3) at nodes, axes (3, 3), what the third axis sees
+    at rest, white noise of each sample."""
 
     bias: Floats
     gain: Floats
     axes: Floats
+    rest: float
     white: float
 
 
@@ -140,6 +145,7 @@ class ImuSensor:
                     triad.bias,
                     triad.gain,
                     triad.axes,
+                    triad.rest,
                     triad.white,
                     noise[:, 3 * k : 3 * k + 3],
                 )
@@ -196,14 +202,16 @@ def _triads(
     """Errors of gyro and accelerometer."""
     ppm = 1e-6
 
-    def triad(turn_on: float, drift: float, density: float, scale: float, bias_k: float, scale_k: float) -> _Triad:
+    def triad(
+        turn_on: float, drift: float, density: float, scale: float, bias_k: float, scale_k: float, rest: float
+    ) -> _Triad:
         wander = GaussMarkov(rng, 3, step_s, spec.bias_time_constant_s).rows(len(temperature))
         constant, warm_bias, constant_scale, warm_scale = rng.standard_normal((4, 3))
         skew = np.radians(flaws.misalignment_deg) * rng.standard_normal((3, 3))
         np.fill_diagonal(skew, 0.0)
         bias = turn_on * constant + drift * wander + bias_k * warm_bias * temperature[:, None]
         gain = 1.0 + scale * ppm * constant_scale + scale_k * ppm * warm_scale * temperature[:, None]
-        return _Triad(bias, gain, np.eye(3) + skew, density / np.sqrt(interval_s))
+        return _Triad(bias, gain, np.eye(3) + skew, rest, density / np.sqrt(interval_s))
 
     gyro = triad(
         spec.gyro_turn_on_bias_deg_per_h * DEG_PER_H,
@@ -212,6 +220,7 @@ def _triads(
         flaws.gyro_scale_ppm,
         flaws.gyro_bias_deg_per_h_per_k * DEG_PER_H,
         flaws.gyro_scale_ppm_per_k,
+        0.0,
     )
     accel = triad(
         spec.accel_turn_on_bias_mg * MILLI_G,
@@ -220,6 +229,7 @@ def _triads(
         flaws.accel_scale_ppm,
         flaws.accel_bias_mg_per_k * MILLI_G,
         flaws.accel_scale_ppm_per_k,
+        STANDARD_GRAVITY,
     )
     return gyro, accel
 

@@ -46,7 +46,14 @@ PresetName = Literal["tactical", "tactical-fog-class", "automotive", "consumer"]
 
 PRESETS: dict[PresetName, ImuPreset] = {
     "tactical": ImuPreset(
-        ImuSpec(gyro_scale_ppm=1000.0, gyro_bias_deg_per_h_per_k=4.0, accel_bias_mg_per_k=0.02),
+        ImuSpec(
+            gyro_scale_ppm=1000.0,
+            gyro_misalignment_deg=0.02,
+            accel_scale_ppm=500.0,
+            accel_misalignment_deg=0.02,
+            gyro_bias_deg_per_h_per_k=4.0,
+            accel_bias_mg_per_k=0.02,
+        ),
         ImuFlaws(
             gyro_scale_ppm=1000.0,
             accel_scale_ppm=500.0,
@@ -69,6 +76,9 @@ PRESETS: dict[PresetName, ImuPreset] = {
             gyro_turn_on_bias_deg_per_h=7.0,
             accel_turn_on_bias_mg=1.7,
             gyro_scale_ppm=300.0,
+            gyro_misalignment_deg=0.01,
+            accel_scale_ppm=300.0,
+            accel_misalignment_deg=0.01,
             gyro_bias_deg_per_h_per_k=0.1,
             accel_bias_mg_per_k=0.01,
         ),
@@ -95,6 +105,8 @@ PRESETS: dict[PresetName, ImuPreset] = {
             accel_turn_on_bias_mg=10.0,
             gyro_scale_ppm=3000.0,
             gyro_misalignment_deg=0.2,
+            accel_scale_ppm=3000.0,
+            accel_misalignment_deg=0.2,
             gyro_bias_deg_per_h_per_k=18.0,
             accel_bias_mg_per_k=0.1,
         ),
@@ -121,6 +133,8 @@ PRESETS: dict[PresetName, ImuPreset] = {
             accel_turn_on_bias_mg=20.0,
             gyro_scale_ppm=4000.0,
             gyro_misalignment_deg=0.3,
+            accel_scale_ppm=4000.0,
+            accel_misalignment_deg=0.3,
             gyro_bias_deg_per_h_per_k=72.0,
             accel_bias_mg_per_k=0.25,
         ),

@@ -22,14 +22,13 @@ START_NS = 1_715_673_600_000_000_000
 
 
 def straight(speed_at: Floats, seconds: float) -> Drive:
-    """A level line at a speed given every KNOT_S, with a consumer IMU."""
+    """A level line at a speed given every KNOT_S, with a consumer IMU whose accelerometer has no scale errors."""
     none = np.zeros(round(seconds / KNOT_S) + 20)
     speed = np.concatenate((speed_at, np.full(max(len(none) - len(speed_at), 0), speed_at[-1])))[: len(none)]
     truth = Truth(Profile(-2.0, speed, none + 0.7, none, none), (0.84, 0.2, 560.0), START_NS)
-    config = msgspec.structs.replace(
-        scenarios.load("clean"),
-        vehicle=msgspec.structs.replace(scenarios.load("clean").vehicle, imu=PRESETS["consumer"].spec),
-    )
+    imu = msgspec.structs.replace(PRESETS["consumer"].spec, accel_scale_ppm=0.0, accel_misalignment_deg=0.0)
+    clean = scenarios.load("clean")
+    config = msgspec.structs.replace(clean, vehicle=msgspec.structs.replace(clean.vehicle, imu=imu))
     return sense(truth, seconds, 42, config)
 
 

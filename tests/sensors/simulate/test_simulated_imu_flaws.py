@@ -52,6 +52,22 @@ def test_presets_are_ordered_by_grade_and_keep_to_what_is_quoted_of_their_parts(
         assert f"{density_mdps:g} mdps and {density_ug:g} ug" in PRESETS[name].source
 
 
+def test_at_rest_the_accelerometers_bias_is_all_that_it_is_off() -> None:
+    """What scale and misalignment make of gravity is part of it; without flaws nothing is."""
+    drive = simulate_drive(5.0, 3, DriveConfig(imu=ImuSimulation(preset="consumer")))
+    none = simulate_drive(5.0, 3, DriveConfig(imu=ImuSimulation(preset="consumer", flaws=ImuFlaws())))
+    first = drive.log.imu
+    assert first is not None
+    rest = slice(0, 100)
+    off = (first.accel - drive.truth.inertial(first.t_ns)[1] - drive.imu_biases.accel)[rest]
+    white = PRESETS["consumer"].spec.accel_noise_m_per_s_per_sqrt_h / 60 * 10
+    assert np.linalg.norm(drive.truth.at(first.t_ns[rest]).vel_enu, axis=1).max() < 1e-6
+    assert np.abs(off.mean(axis=0)).max() < 4 * white / 10
+    of_gravity = (drive.imu_biases.accel - none.imu_biases.accel)[0]
+    assert np.abs(of_gravity).min() > 1e-3
+    assert np.abs(of_gravity).max() < STANDARD_GRAVITY * 4 * np.radians(0.3)
+
+
 def test_a_preset_beside_a_datasheet_is_refused() -> None:
     with pytest.raises(EgolocError, match=r"imu\.preset: expected no \[vehicle\.imu\] beside it, got both"):
         DriveConfig(imu=ImuSimulation(preset="consumer"), vehicle=Vehicle(imu=QUIET))
