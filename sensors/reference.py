@@ -9,8 +9,6 @@ import hashlib
 from functools import cache
 from typing import Any
 
-from llvmlite import ir
-from llvmlite.binding import TargetData
 from numba.core import cgutils, types
 from numba.core.datamodel import models
 from numba.core.typing.templates import AttributeTemplate
@@ -35,7 +33,7 @@ class _ReferenceModel(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, reference, cgutils.voidptr_t)
 
 
-@intrinsic
+@intrinsic  # type: ignore[untyped-decorator]
 def by_reference(_context: Any, value: Any) -> Any:
     """Refer to a named tuple; in a loop it is another one every time, at the same place."""
     if isinstance(value, Reference):
@@ -64,11 +62,12 @@ class _Fields(AttributeTemplate):  # type: ignore[misc]
         return Reference(found) if isinstance(found, types.BaseNamedTuple) else found
 
 
-@lower_getattr_generic(Reference)
+@lower_getattr_generic(Reference)  # type: ignore[untyped-decorator]
 def _read(context: Any, builder: Any, reference: Reference, address: Any, field: str) -> Any:
     place = reference.target.fields.index(field)
-    found, layout = reference.target.types[place], context.get_data_type(reference.target)
-    at = builder.gep(address, [ir.Constant(ir.IntType(64), _offsets(layout, context.target_data)[place])], inbounds=True)
+    found = reference.target.types[place]
+    offset = _offsets(context.get_data_type(reference.target), context.target_data)[place]
+    at = builder.gep(address, [cgutils.intp_t(offset)], inbounds=True)
     if isinstance(found, types.BaseNamedTuple):
         return at
     model = context.data_model_manager[found]
@@ -76,8 +75,8 @@ def _read(context: Any, builder: Any, reference: Reference, address: Any, field:
 
 
 @cache
-def _offsets(layout: ir.LiteralStructType | ir.ArrayType, data: TargetData) -> list[int]:
-    """Bytes from the beginning of a tuple to each field; llvmlite lays out those of one type as an array."""
-    if isinstance(layout, ir.ArrayType):
-        return [i * layout.element.get_abi_size(data) for i in range(layout.count)]
-    return [layout.get_element_offset(data, i) for i in range(len(layout.elements))]
+def _offsets(layout: Any, target_data: Any) -> list[int]:
+    """Bytes from the beginning of a tuple to each field. layout: its LLVM type, an array where all have one type."""
+    if hasattr(layout, "count"):
+        return [i * layout.element.get_abi_size(target_data) for i in range(layout.count)]
+    return [layout.get_element_offset(target_data, i) for i in range(len(layout.elements))]
