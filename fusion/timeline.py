@@ -24,8 +24,8 @@ STANDARD_GRAVITY = 9.80665
 _ROOT_HOUR = 60.0
 _DEG_PER_H = math.pi / 180.0 / 3600.0
 _MILLI_G = 1e-3 * STANDARD_GRAVITY
-_CHANGE = 10.0
-"""By so much a manoeuvre changes the velocity (a stop, a corner), m/s: of a share e of it, which the accelerometer
+_CHANGE = 5.0
+"""So much of a change of velocity is not taken back by the next one, m/s: of a share e of it, which the accelerometer
 misses, the variance is e^2 times its square; as a walk along the change that is this times e^2 for each m/s."""
 
 

@@ -98,11 +98,12 @@ def positions_only() -> FusionConfig:
 
 
 def grade_log(grade: PresetName, seed: int, seconds: float = SIMULATED_S) -> Log:
-    """City drive with white GNSS errors, neither pose fixes nor wheel speed, and an IMU of a grade with its flaws."""
-    scenario = load("clean")
+    """City drive with white GNSS errors, neither pose fixes nor wheel speed, and an IMU of a grade with its flaws, which
+    shakes and warms up as on the road test."""
+    scenario, road = load("clean"), load("road-test")
     gnss = msgspec.structs.replace(scenario.gnss, rate_hz=SIMULATED_HZ)
     without = {name: msgspec.structs.replace(getattr(scenario, name), use=False) for name in ("pose_fix", "wheel")}
-    imu = msgspec.structs.replace(scenario.imu, preset=grade)
+    imu = msgspec.structs.replace(road.imu, preset=grade)
     return simulate(seconds, seed, msgspec.structs.replace(scenario, imu=imu, gnss=gnss, **without))
 
 
