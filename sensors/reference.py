@@ -7,12 +7,14 @@ on. Fields read the same from both, so what is called cannot tell, and Python ma
 
 import hashlib
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 from numba.core import cgutils, types
 from numba.core.datamodel import models
 from numba.core.typing.templates import AttributeTemplate
-from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, register_model
+from numba.extending import infer_getattr, lower_builtin, lower_getattr_generic, register_model, type_callable
+
+Named = TypeVar("Named", bound=NamedTuple)
 
 
 class Reference(types.Type):  # type: ignore[misc]
@@ -33,20 +35,31 @@ class _ReferenceModel(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, reference, cgutils.voidptr_t)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def by_reference(_context: Any, value: Any) -> Any:
-    """Refer to a named tuple; in a loop it is another one every time, at the same place."""
-    if isinstance(value, Reference):
-        return value(value), lambda _context, _builder, _signature, args: args[0]
-    if not isinstance(value, types.BaseNamedTuple):
-        return None
+def by_reference(value: Named) -> Named:
+    """Refer to a named tuple; in a loop it is another one every time, at the same place. In plain Python: itself."""
+    return value
 
-    def refer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        model = context.data_model_manager[signature.args[0]]
-        place = cgutils.alloca_once_value(builder, model.as_data(builder, args[0]))
-        return builder.bitcast(place, cgutils.voidptr_t)
 
-    return Reference(value)(value), refer
+@type_callable(by_reference)  # type: ignore[untyped-decorator]
+def _reference_to(_context: Any) -> Any:
+    def typed(value: Any) -> Any:
+        if isinstance(value, Reference):
+            return value
+        return Reference(value) if isinstance(value, types.BaseNamedTuple) else None
+
+    return typed
+
+
+@lower_builtin(by_reference, types.BaseNamedTuple)  # type: ignore[untyped-decorator]
+def _refer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    model = context.data_model_manager[signature.args[0]]
+    place = cgutils.alloca_once_value(builder, model.as_data(builder, args[0]))
+    return builder.bitcast(place, cgutils.voidptr_t)
+
+
+@lower_builtin(by_reference, Reference)  # type: ignore[untyped-decorator]
+def _same(_context: Any, _builder: Any, _signature: Any, args: Any) -> Any:
+    return args[0]
 
 
 @infer_getattr
