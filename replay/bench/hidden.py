@@ -98,8 +98,10 @@ def positions_only() -> FusionConfig:
 
 
 def grade_log(grade: PresetName, seed: int, seconds: float = SIMULATED_S) -> Log:
-    """City drive with white GNSS errors, neither pose fixes nor wheel speed, and an IMU of a grade with its flaws, which
-    shakes and warms up as on the road test."""
+    """City drive with white GNSS errors, neither pose fixes nor wheel speed.
+
+    An IMU of a grade with its flaws, which shakes and warms up as on the road test.
+    """
     scenario, road = load("clean"), load("road-test")
     gnss = msgspec.structs.replace(scenario.gnss, rate_hz=SIMULATED_HZ)
     without = {name: msgspec.structs.replace(getattr(scenario, name), use=False) for name in ("pose_fix", "wheel")}
