@@ -31,15 +31,28 @@ def figures(of: Any) -> list[Any]:
     return [of]
 
 
+def alike(ours: list[Any], theirs: list[Any]) -> None:
+    for one, other in zip(ours, theirs, strict=True):
+        assert one == (pytest.approx(other, rel=1e-8, abs=NANOMETRES) if isinstance(other, float) else other)
+
+
 def test_a_written_drive_is_replayed_as_the_one_in_memory(tmp_path: Path) -> None:
     path = tmp_path / "road.mcap"
     assert main(["simulate", "road-test", str(path), "--length-km", "2", "--seed", "3"]) == 0
     assert main(["info", str(path)]) == 0
-    written = figures(metrics(str(path), tmp_path / "written"))
-    in_memory = figures(metrics("scenario:road-test,seed=3,length_km=2", tmp_path / "in_memory"))
+    both = (
+        metrics(str(path), tmp_path / "written"),
+        metrics("scenario:road-test,seed=3,length_km=2", tmp_path / "in_memory"),
+    )
+    estimates = [found.pop("estimates") for found in both]
+    written, in_memory = map(figures, both)
     assert len(written) == len(in_memory) > 300
-    for one, other in zip(written, in_memory, strict=True):
-        assert one == (pytest.approx(other, rel=1e-8, abs=NANOMETRES) if isinstance(other, float) else other)
+    alike(written, in_memory)
+    assert len(estimates[0]) == len(estimates[1]) > 1
+    for one, other in zip(*estimates, strict=True):  # that of a place's sigma is so much of an estimate's as well
+        share = NANOMETRES / 0.01 * other["sigma"]
+        assert one.pop("value") == pytest.approx(other.pop("value"), abs=share)
+        alike(figures(one), figures(other))
 
 
 def test_the_scenario_of_the_docs_along_the_boreas_drive_is_simulated_and_replayed(data: Path, tmp_path: Path) -> None:
