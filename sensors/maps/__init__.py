@@ -1,0 +1,1 @@
+"""Lightweight vector maps: one schema, importers, surfels, one file of compressed columns."""
