@@ -1,0 +1,178 @@
+"""The columns of a map file, as of version 1: a tile's elements and surfels as a table, and back.
+
+One row an element and one a surfel; all numbers are integers (``sensors.maps.quantized``), all codes words.
+"""
+
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from sensors.errors import EgolocError
+from sensors.geodesy import MapFrame
+from sensors.maps.quantized import (
+    bytes_from_normals,
+    bytes_from_ratios,
+    cm_from_m,
+    m_from_cm,
+    normals_from_bytes,
+    ratios_from_bytes,
+)
+from sensors.maps.vector_map import Colour, Elements, Kind, Style, Surfels
+
+VERSION = 1
+FACTS_KEY = b"egoloc_map"
+"""Of the footer's key-value metadata: Facts as JSON."""
+SURFEL = "surfel"
+"""Word for a surfel in the column kind."""
+
+KINDS = tuple(kind.name.lower() for kind in Kind)
+STYLES = tuple(style.name.lower() for style in Style)
+COLOURS = tuple(colour.name.lower() for colour in Colour)
+WORDS: Final = {"kind": (*KINDS, SURFEL), "style": STYLES, "colour": COLOURS}
+
+_LIST = pa.list_(pa.int32())
+SCHEMA = pa.schema(
+    [
+        *((name, pa.string()) for name in WORDS),
+        ("source", pa.int32()),
+        ("name", pa.string()),
+        *((axis, _LIST) for axis in "xyz"),
+        *((name, pa.uint8()) for name in ("normal_u", "normal_v", "ratio_2", "ratio_3")),
+    ]
+)
+MEANING = {
+    "rows": "a row group is a tile, which holds what begins in it; its surfels come last, by rising x",
+    "kind": f"{', '.join(KINDS)}, or {SURFEL}: a planar patch, the columns style to name are null",
+    "source": "which of the sources, from 0",
+    "x, y": "of each vertex, cm in the map's frame: divide by 100; at most 0.5 cm off",
+    "z": "height of each vertex, cm in the map's frame; null: not known",
+    "normal_u, normal_v": "of a surfel: u, v = (column - 127) / 127; the normal is along "
+    "((u + v) / 2, (u - v) / 2, 1 - max(|u|, |v|)); at most 0.66 deg off",
+    "ratio_2, ratio_3": "of a surfel: lambda1/lambda2 and lambda1/lambda3 = (column / 255)^2; r is at most "
+    "sqrt(r) / 255 + 4e-6 off",
+    "tiles": "of each row group: least x, least y, greatest x, greatest y of its vertices, cm",
+}
+
+
+class Facts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the footer says of a map; counts: rows by kind; tiles: boxes of what each row group holds, cm."""
+
+    version: int
+    frame: MapFrame
+    sources: tuple[str, ...]
+    road_km: float | None
+    tile_m: float
+    counts: dict[str, int]
+    tiles: list[tuple[int, int, int, int]]
+    columns: dict[str, str]
+
+
+def table_of(elements: Elements, surfels: Surfels) -> tuple[pa.Table, tuple[int, int, int, int]]:
+    """A tile's table, and the box of its vertices, cm. Coordinates must be within CM_LIMIT."""
+    nothing = np.ones(len(surfels), np.bool_)
+    place = np.column_stack((surfels.p, surfels.z))
+    x, y, z = cm_from_m(np.concatenate((elements.xyz, place))).T
+    offsets = np.concatenate((elements.first, elements.first[-1] + 1 + np.arange(len(surfels)))).astype(np.int32)
+    axes = [pa.array(x.astype(np.int32)), pa.array(y.astype(np.int32)), _heights(z)]
+    codes = np.concatenate((bytes_from_normals(surfels.normal), bytes_from_ratios(surfels.ratios)), axis=1)
+    kind = np.concatenate((elements.kind, np.full(len(surfels), len(KINDS), np.int8)))
+    columns = [
+        pa.DictionaryArray.from_arrays(kind, pa.array(WORDS["kind"])).dictionary_decode(),
+        _words(elements.style, STYLES, nothing),
+        _words(elements.colour, COLOURS, nothing),
+        pa.array(_padded(elements.source, nothing), mask=_mask(len(elements), nothing)),
+        pa.concat_arrays([pa.array(elements.name.tolist(), pa.string()), pa.nulls(len(surfels), pa.string())]),
+        *(pa.ListArray.from_arrays(offsets, values) for values in axes),
+        *(pa.concat_arrays([pa.nulls(len(elements), pa.uint8()), pa.array(column)]) for column in codes.T.copy()),
+    ]
+    return pa.table(columns, schema=SCHEMA), (int(x.min()), int(y.min()), int(x.max()), int(y.max()))
+
+
+def _heights(z: NDArray[np.float64]) -> pa.Array:
+    unknown = np.isnan(z)
+    return pa.array(np.where(unknown, 0.0, z).astype(np.int32), mask=unknown)
+
+
+def _words(codes: NDArray[np.int8], words: tuple[str, ...], nothing: NDArray[np.bool_]) -> pa.Array:
+    indices = pa.array(_padded(codes, nothing), mask=_mask(len(codes), nothing))
+    return pa.DictionaryArray.from_arrays(indices, pa.array(words)).dictionary_decode()
+
+
+def _padded(column: NDArray[Any], nothing: NDArray[np.bool_]) -> NDArray[Any]:
+    return np.concatenate((column, np.zeros(len(nothing), column.dtype)))
+
+
+def _mask(count: int, nothing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return np.concatenate((np.zeros(count, np.bool_), nothing))
+
+
+def tile_of(table: pa.Table) -> tuple[Elements, Surfels]:
+    """Elements and surfels of a table with the columns of SCHEMA, words dictionary-encoded, its rows in any order.
+
+    Raises EgolocError where it is no map's: nulls where a number must be, unknown words, a surfel of two vertices.
+    """
+    column = {name: table.column(name).combine_chunks() for name in table.column_names}
+    counts = _counts(column)
+    first = np.concatenate(([0], np.cumsum(counts)))
+    xy = [m_from_cm(_numbers(column[axis].flatten(), axis)) for axis in "xy"]
+    xyz = np.stack((*xy, m_from_cm(column["z"].flatten().to_numpy(zero_copy_only=False))), axis=-1)
+    kind = _codes(column["kind"], "kind")
+    patch = kind == len(KINDS)
+    return _elements(column, ~patch, kind, counts, xyz), _surfels(column, patch, counts, xyz[first[:-1][patch]])
+
+
+def _elements(
+    column: dict[str, Any],
+    chosen: NDArray[np.bool_],
+    kind: NDArray[np.int8],
+    counts: NDArray[np.int64],
+    xyz: NDArray[np.float64],
+) -> Elements:
+    rows = np.flatnonzero(chosen)
+    some = {name: column[name].take(pa.array(rows)) for name in ("style", "colour", "source", "name")}
+    codes = kind[rows], _codes(some["style"], "style"), _codes(some["colour"], "colour")
+    first = np.concatenate(([0], np.cumsum(counts[rows])))
+    source = _numbers(some["source"], "source").astype(np.int32)
+    name = np.array(some["name"].fill_null("").to_pylist(), np.str_)
+    return Elements(*codes, first, xyz[np.repeat(chosen, counts)], source, name)
+
+
+def _surfels(
+    column: dict[str, Any], chosen: NDArray[np.bool_], counts: NDArray[np.int64], place: NDArray[np.float64]
+) -> Surfels:
+    if (counts[chosen] != 1).any():
+        raise EgolocError(f"x: expected one vertex of a surfel, got {counts[chosen].max()}")
+    rows = pa.array(np.flatnonzero(chosen))
+    codes = {name: _numbers(column[name].take(rows), name) for name in SCHEMA.names[-4:]}
+    normal = normals_from_bytes(np.stack((codes["normal_u"], codes["normal_v"]), axis=-1))
+    ratios = ratios_from_bytes(np.stack((codes["ratio_2"], codes["ratio_3"]), axis=-1))
+    return Surfels(place[:, :2], place[:, 2], normal, ratios)
+
+
+def _counts(column: dict[str, Any]) -> NDArray[np.int64]:
+    """(N,) vertices of each row, the same in x, y and z."""
+    x, y, z = (_numbers(column[axis].value_lengths(), axis).astype(np.int64) for axis in "xyz")
+    if not (np.array_equal(x, y) and np.array_equal(x, z)):
+        raise EgolocError("x, y, z: expected lists of the same lengths")
+    return x
+
+
+def _numbers(array: pa.Array, name: str) -> NDArray[Any]:
+    if array.null_count:
+        raise EgolocError(f"{name}: expected numbers, got {array.null_count} nulls")
+    numbers: NDArray[Any] = array.to_numpy(zero_copy_only=False)
+    return numbers
+
+
+def _codes(array: pa.DictionaryArray, name: str) -> NDArray[np.int8]:
+    """(N,) place of each word in WORDS[name]."""
+    known = {word: code for code, word in enumerate(WORDS[name])}
+    words = array.dictionary.to_pylist()
+    unknown = [word for word in words if word not in known]
+    if unknown:
+        raise EgolocError(f"{name}: expected one of {', '.join(known)}, got {unknown[0]!r}")
+    codes = np.array([known[word] for word in words], np.int8)
+    return codes[_numbers(array.indices, name)]
