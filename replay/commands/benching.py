@@ -204,11 +204,32 @@ class BenchConsistency:
         _printed("consistency", work, consistency.table, self.json)
 
 
+@dataclass(frozen=True)
+class BenchMaps:
+    """Size of map files by kind and column, and how fast a large one opens and answers, on one core."""
+
+    repeats: Number = 3
+    """Passes over the places that are asked for; of each place its least time counts."""
+    km: Annotated[float, tyro.conf.arg(metavar="KM")] = 1000.0
+    """Streets of the large map, km."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import maps
+
+        _at_least_one(repeats=self.repeats)
+        _above_zero(km=(self.km,))
+        _timed("maps", lambda: maps.run(self.repeats, self.km), self.json)
+
+
 BENCHMARKS = {
     "filter": BenchFilter,
     "live": BenchLive,
     "replay": BenchReplay,
     "mcap": BenchMcap,
+    "maps": BenchMaps,
     "gates": BenchGates,
     "faults": BenchFaults,
     "hidden": BenchHidden,

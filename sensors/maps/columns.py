@@ -50,7 +50,7 @@ MEANING = {
     "x, y": "of each vertex, cm in the map's frame: divide by 100; at most 0.5 cm off",
     "z": "height of each vertex, cm in the map's frame; null: not known",
     "normal_u, normal_v": "of a surfel: u, v = (column - 127) / 127; the normal is along "
-    "((u + v) / 2, (u - v) / 2, 1 - max(|u|, |v|)); at most 0.66 deg off",
+    "((u + v) / 2, (u - v) / 2, 1 - max(|u|, |v|)); at most 0.56 deg off",
     "ratio_2, ratio_3": "of a surfel: lambda1/lambda2 and lambda1/lambda3 = (column / 255)^2; r is at most "
     "sqrt(r) / 255 + 4e-6 off",
     "tiles": "of each row group: least x, least y, greatest x, greatest y of its vertices, cm",
@@ -110,46 +110,43 @@ def _mask(count: int, nothing: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def tile_of(table: pa.Table) -> tuple[Elements, Surfels]:
-    """Elements and surfels of a table with the columns of SCHEMA, words dictionary-encoded, its rows in any order.
+    """Elements and surfels of a table with the columns of SCHEMA, words dictionary-encoded.
 
-    Raises EgolocError where it is no map's: nulls where a number must be, unknown words, a surfel of two vertices.
+    Raises EgolocError where it is no tile: nulls where a number must be, unknown words, a surfel of two vertices or
+    before an element.
     """
     column = {name: table.column(name).combine_chunks() for name in table.column_names}
-    counts = _counts(column)
-    first = np.concatenate(([0], np.cumsum(counts)))
-    xy = [m_from_cm(_numbers(column[axis].flatten(), axis)) for axis in "xy"]
-    xyz = np.stack((*xy, m_from_cm(column["z"].flatten().to_numpy(zero_copy_only=False))), axis=-1)
     kind = _codes(column["kind"], "kind")
-    patch = kind == len(KINDS)
-    return _elements(column, ~patch, kind, counts, xyz), _surfels(column, patch, counts, xyz[first[:-1][patch]])
+    count = len(kind) - int((kind == len(KINDS)).sum())
+    if (kind[:count] == len(KINDS)).any():
+        raise EgolocError("kind: expected all surfels after the elements")
+    first = np.concatenate(([0], np.cumsum(_counts(column))))
+    xyz = np.empty((first[-1], 3))
+    for axis, name in enumerate("xy"):
+        xyz[:, axis] = _numbers(column[name].flatten(), name)
+    xyz[:, 2] = column["z"].flatten().to_numpy(zero_copy_only=False)
+    xyz = m_from_cm(xyz)
+    if (np.diff(first[count:]) != 1).any():
+        raise EgolocError("x: expected one vertex of each surfel")
+    vertices = int(first[count])
+    return _elements(column, kind[:count], first[: count + 1], xyz[:vertices]), _surfels(column, count, xyz[vertices:])
 
 
 def _elements(
-    column: dict[str, Any],
-    chosen: NDArray[np.bool_],
-    kind: NDArray[np.int8],
-    counts: NDArray[np.int64],
-    xyz: NDArray[np.float64],
+    column: dict[str, Any], kind: NDArray[np.int8], first: NDArray[np.int64], xyz: NDArray[np.float64]
 ) -> Elements:
-    rows = np.flatnonzero(chosen)
-    some = {name: column[name].take(pa.array(rows)) for name in ("style", "colour", "source", "name")}
-    codes = kind[rows], _codes(some["style"], "style"), _codes(some["colour"], "colour")
-    first = np.concatenate(([0], np.cumsum(counts[rows])))
-    source = _numbers(some["source"], "source").astype(np.int32)
-    name = np.array(some["name"].fill_null("").to_pylist(), np.str_)
-    return Elements(*codes, first, xyz[np.repeat(chosen, counts)], source, name)
+    """The first rows of the columns."""
+    style, colour, source, name = (column[key][: len(kind)] for key in ("style", "colour", "source", "name"))
+    codes = kind, _codes(style, "style"), _codes(colour, "colour")
+    names = np.array(name.fill_null("").to_pylist(), np.str_)
+    return Elements(*codes, first, xyz, _numbers(source, "source"), names)
 
 
-def _surfels(
-    column: dict[str, Any], chosen: NDArray[np.bool_], counts: NDArray[np.int64], place: NDArray[np.float64]
-) -> Surfels:
-    if (counts[chosen] != 1).any():
-        raise EgolocError(f"x: expected one vertex of a surfel, got {counts[chosen].max()}")
-    rows = pa.array(np.flatnonzero(chosen))
-    codes = {name: _numbers(column[name].take(rows), name) for name in SCHEMA.names[-4:]}
-    normal = normals_from_bytes(np.stack((codes["normal_u"], codes["normal_v"]), axis=-1))
-    ratios = ratios_from_bytes(np.stack((codes["ratio_2"], codes["ratio_3"]), axis=-1))
-    return Surfels(place[:, :2], place[:, 2], normal, ratios)
+def _surfels(column: dict[str, Any], count: int, place: NDArray[np.float64]) -> Surfels:
+    """The rows from count on."""
+    u, v, second, third = (_numbers(column[name][count:], name) for name in SCHEMA.names[-4:])
+    normal = normals_from_bytes(np.stack((u, v), axis=-1))
+    return Surfels(place[:, :2], place[:, 2], normal, ratios_from_bytes(np.stack((second, third), axis=-1)))
 
 
 def _counts(column: dict[str, Any]) -> NDArray[np.int64]:

@@ -30,7 +30,7 @@ def m_from_cm(centimetres: NDArray[Any]) -> Floats:
 
 
 def bytes_from_normals(normal: Floats) -> Bytes:
-    """(K, 2) of unit vectors (K, 3): octahedral coordinates of the upper half, at most 0.66 deg off.
+    """(K, 2) of unit vectors (K, 3): octahedral coordinates of the upper half, at most 0.56 deg off.
 
     A plane has no side: a normal that points down is turned round. Level and upright normals come back as such.
     Raises EgolocError for vectors that are not of unit length. Source: Cigolle et al., A Survey of Efficient
