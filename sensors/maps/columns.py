@@ -115,7 +115,7 @@ def tile_of(table: pa.Table) -> tuple[Elements, Surfels]:
     Raises EgolocError where it is no tile: nulls where a number must be, unknown words, a surfel of two vertices or
     before an element.
     """
-    column = {name: table.column(name).combine_chunks() for name in table.column_names}
+    column = {name: table.column(name).combine_chunks() for name in SCHEMA.names}
     kind = _codes(column["kind"], "kind")
     count = len(kind) - int((kind == len(KINDS)).sum())
     if (kind[:count] == len(KINDS)).any():
@@ -124,7 +124,8 @@ def tile_of(table: pa.Table) -> tuple[Elements, Surfels]:
     xyz = np.empty((first[-1], 3))
     for axis, name in enumerate("xy"):
         xyz[:, axis] = _numbers(column[name].flatten(), name)
-    xyz[:, 2] = column["z"].flatten().to_numpy(zero_copy_only=False)
+    height = column["z"].flatten()
+    xyz[:, 2] = np.where(_known(height), _values(height), np.nan)
     xyz = m_from_cm(xyz)
     if (np.diff(first[count:]) != 1).any():
         raise EgolocError("x: expected one vertex of each surfel")
@@ -138,8 +139,8 @@ def _elements(
     """The first rows of the columns."""
     style, colour, source, name = (column[key][: len(kind)] for key in ("style", "colour", "source", "name"))
     codes = kind, _codes(style, "style"), _codes(colour, "colour")
-    names = np.array(name.fill_null("").to_pylist(), np.str_)
-    return Elements(*codes, first, xyz, _numbers(source, "source"), names)
+    names = [text or "" for text in name.to_pylist()]
+    return Elements(*codes, first, xyz, _numbers(source, "source"), np.array(names, np.str_))
 
 
 def _surfels(column: dict[str, Any], count: int, place: NDArray[np.float64]) -> Surfels:
@@ -151,7 +152,10 @@ def _surfels(column: dict[str, Any], count: int, place: NDArray[np.float64]) -> 
 
 def _counts(column: dict[str, Any]) -> NDArray[np.int64]:
     """(N,) vertices of each row, the same in x, y and z."""
-    x, y, z = (_numbers(column[axis].value_lengths(), axis).astype(np.int64) for axis in "xyz")
+    for axis in "xyz":
+        if column[axis].null_count:
+            raise EgolocError(f"{axis}: expected lists, got {column[axis].null_count} nulls")
+    x, y, z = (np.diff(_values(column[axis].offsets)).astype(np.int64) for axis in "xyz")
     if not (np.array_equal(x, y) and np.array_equal(x, z)):
         raise EgolocError("x, y, z: expected lists of the same lengths")
     return x
@@ -160,8 +164,27 @@ def _counts(column: dict[str, Any]) -> NDArray[np.int64]:
 def _numbers(array: pa.Array, name: str) -> NDArray[Any]:
     if array.null_count:
         raise EgolocError(f"{name}: expected numbers, got {array.null_count} nulls")
-    numbers: NDArray[Any] = array.to_numpy(zero_copy_only=False)
-    return numbers
+    return _values(array)
+
+
+# pyarrow's own to_numpy imports pandas where that is installed, a quarter of a second
+
+
+def _values(array: pa.Array) -> NDArray[Any]:
+    """(N,) numbers; anything where they are null."""
+    dtype = array.type.to_pandas_dtype()
+    buffer = array.buffers()[1]
+    if not len(array) or buffer is None:
+        return np.zeros(len(array), dtype)
+    return np.frombuffer(buffer, dtype, array.offset + len(array))[array.offset :]
+
+
+def _known(array: pa.Array) -> NDArray[np.bool_]:
+    """(N,) where it is not null."""
+    if not array.null_count:
+        return np.ones(len(array), np.bool_)
+    bits = np.unpackbits(np.frombuffer(array.buffers()[0], np.uint8), bitorder="little")
+    return bits[array.offset : array.offset + len(array)].astype(np.bool_)
 
 
 def _codes(array: pa.DictionaryArray, name: str) -> NDArray[np.int8]:

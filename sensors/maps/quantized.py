@@ -49,11 +49,10 @@ def bytes_from_normals(normal: Floats) -> Bytes:
 
 def normals_from_bytes(codes: Bytes) -> Floats:
     """(K, 3) unit vectors, z >= 0."""
-    u, v = (codes.astype(np.float64).T - NORMAL_STEPS) / NORMAL_STEPS
+    u, v = (codes.T.astype(np.float64) - NORMAL_STEPS) / NORMAL_STEPS
+    x, y = (u + v) / 2.0, (u - v) / 2.0
     z = np.maximum(1.0 - np.maximum(np.abs(u), np.abs(v)), 0.0)
-    normal = np.stack(((u + v) / 2.0, (u - v) / 2.0, z), axis=-1)
-    result: Floats = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    return result
+    return np.stack((x, y, z), axis=-1) / np.sqrt(x * x + y * y + z * z)[:, None]
 
 
 def bytes_from_ratios(ratios: Floats) -> Bytes:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
 
-MOST = 8_192
+MOST = 12_000
 """Vertices and surfels of a tile beyond which it is quartered: so a query reads no more where a city is dense."""
 HALVINGS = 10
 """How often a tile's side is halved at most; what lies in one place stays together."""
