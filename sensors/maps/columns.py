@@ -123,8 +123,8 @@ def tile_of(table: pa.Table) -> tuple[Elements, Surfels]:
     first = np.concatenate(([0], np.cumsum(_counts(column))))
     xyz = np.empty((first[-1], 3))
     for axis, name in enumerate("xy"):
-        xyz[:, axis] = _numbers(column[name].flatten(), name)
-    height = column["z"].flatten()
+        xyz[:, axis] = _numbers(_vertices(column[name]), name)
+    height = _vertices(column["z"])
     xyz[:, 2] = np.where(_known(height), _values(height), np.nan)
     xyz = m_from_cm(xyz)
     if (np.diff(first[count:]) != 1).any():
@@ -161,13 +161,19 @@ def _counts(column: dict[str, Any]) -> NDArray[np.int64]:
     return x
 
 
+def _vertices(lists: pa.ListArray) -> pa.Array:
+    """What stands in the lists, one after the other."""
+    offsets = _values(lists.offsets)
+    return lists.values[int(offsets[0]) : int(offsets[-1])]
+
+
 def _numbers(array: pa.Array, name: str) -> NDArray[Any]:
     if array.null_count:
         raise EgolocError(f"{name}: expected numbers, got {array.null_count} nulls")
     return _values(array)
 
 
-# pyarrow's own to_numpy imports pandas where that is installed, a quarter of a second
+# flatten and to_numpy of pyarrow would import its compute functions and, where it is installed, pandas: 0.3 s
 
 
 def _values(array: pa.Array) -> NDArray[Any]:
@@ -195,4 +201,7 @@ def _codes(array: pa.DictionaryArray, name: str) -> NDArray[np.int8]:
     if unknown:
         raise EgolocError(f"{name}: expected one of {', '.join(known)}, got {unknown[0]!r}")
     codes = np.array([known[word] for word in words], np.int8)
-    return codes[_numbers(array.indices, name)]
+    places = _numbers(array.indices, name)
+    if len(places) and not (places.min() >= 0 and places.max() < len(codes)):
+        raise EgolocError(f"{name}: expected words of its dictionary")
+    return codes[places]

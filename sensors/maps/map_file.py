@@ -43,8 +43,8 @@ class _Tile(NamedTuple):
 class MapFile:
     """An open map file; made by ``open_map``. Not for several threads at once.
 
-    facts: what the footer says: frame, sources, road_km, tile_m, counts of rows by kind; boxes: (T, 4) least x, least y,
-    greatest x, greatest y of what each tile holds, m.
+    facts: what the footer says: frame, sources, road_km, tile_m, counts of rows by kind; boxes: (T, 4) least x, y,
+    greatest x, y of what each tile holds, m.
     """
 
     def __init__(self, path: Path, parquet: pq.ParquetFile, facts: Facts, cache_mb: float) -> None:
@@ -121,7 +121,7 @@ class MapFile:
                 raise EgolocError(f"source: expected 0..{sources - 1}, got {elements.source.max()}")
         except EgolocError as error:
             raise EgolocError(f"{self.path}: tile {number}: {error}") from None
-        except (OSError, pa.ArrowException) as error:
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
             raise EgolocError(f"{self.path}: tile {number}: damaged: {_reason(error)}") from None
         return _Tile(elements, surfels, _boxes(elements))
 
@@ -133,36 +133,33 @@ def open_map(path: str | os.PathLike[str], cache_mb: float = CACHE_MB) -> MapFil
     """
     source = Path(path)
     try:
-        parquet = pq.ParquetFile(source, read_dictionary=list(WORDS), page_checksum_verification=True)
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        source.open("rb").close()  # Python's messages are shorter than pyarrow's
+        footer = pq.read_metadata(source)
+        schema = footer.schema.to_arrow_schema()
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError) as error:
         raise EgolocError(f"{source}: expected a map of egoloc, got no whole Parquet file: {_reason(error)}") from None
-    except OSError as error:
+    except (OSError, pa.ArrowException) as error:
         raise EgolocError(f"{source}: cannot be read: {_reason(error)}") from None
-    try:
-        return MapFile(source, parquet, _facts(source, parquet), cache_mb)
-    except EgolocError:
-        parquet.close()
-        raise
+    facts = _facts(source, footer)
+    if schema.names != SCHEMA.names or schema.types != SCHEMA.types:
+        raise EgolocError(f"{source}: expected the columns {', '.join(SCHEMA.names)} of integers and words")
+    if footer.num_row_groups != len(facts.tiles):
+        raise EgolocError(f"{source}: expected {len(facts.tiles)} tiles, got {footer.num_row_groups}")
+    parquet = pq.ParquetFile(source, metadata=footer, read_dictionary=list(WORDS), page_checksum_verification=True)
+    return MapFile(source, parquet, facts, cache_mb)
 
 
-def _facts(source: Path, parquet: pq.ParquetFile) -> Facts:
-    text = (parquet.metadata.metadata or {}).get(FACTS_KEY)
+def _facts(source: Path, footer: pq.FileMetaData) -> Facts:
+    text = (footer.metadata or {}).get(FACTS_KEY)
     if text is None:
         raise EgolocError(f"{source}: expected a map of egoloc, got another Parquet file")
     try:
         version = msgspec.json.decode(text, type=_Version).version
         if version != VERSION:
             raise EgolocError(f"{source}: expected a map of version {VERSION}, got version {version}: import it again")
-        facts = msgspec.json.decode(text, type=Facts)
+        return msgspec.json.decode(text, type=Facts)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise EgolocError(f"{source}: footer: {error}") from None
-    schema = parquet.schema_arrow
-    expected = [pa.dictionary(pa.int32(), pa.string()) if field.name in WORDS else field.type for field in SCHEMA]
-    if schema.names != SCHEMA.names or schema.types != expected:
-        raise EgolocError(f"{source}: expected the columns {', '.join(SCHEMA.names)}, got {', '.join(schema.names)}")
-    if parquet.num_row_groups != len(facts.tiles):
-        raise EgolocError(f"{source}: expected {len(facts.tiles)} tiles, got {parquet.num_row_groups}")
-    return facts
 
 
 def _reason(error: Exception) -> str:
