@@ -71,10 +71,10 @@ def _sizes(path: Path, city: VectorMap) -> list[dict[str, Any]]:
 
 
 def _opening(path: Path) -> list[dict[str, Any]]:
-    first = np.array([first_opening(path) for _ in range(_OPENINGS)])
+    first = [first_opening(path) for _ in range(_OPENINGS)]
     return [
-        row("first opening", "s", first[:, 0]),
-        row("first opening", "memory_mb", first[:, 1]),
+        row("first opening", "s", [seconds for seconds, _ in first]),
+        row("first opening", "memory_mb", [grown for _, grown in first]),
         row("opening", "s", times(lambda: open_map(path).close(), _OPENINGS)),
     ]
 
@@ -90,4 +90,5 @@ def _queries(path: Path, large: VectorMap, repeats: int) -> list[dict[str, Any]]
                     start = time.perf_counter()
                     opened.around(x, y, RADIUS_M)
                     spent[again, place] = min(spent[again, place], time.perf_counter() - start)
-    return [row(f"query, {name}", "ms", values * 1e3) for name, values in zip(("first", "cached"), spent, strict=True)]
+    first, cached = (1e3 * spent).tolist()
+    return [row("query, first", "ms", first), row("query, cached", "ms", cached)]

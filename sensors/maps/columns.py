@@ -200,8 +200,9 @@ def _codes(array: pa.DictionaryArray, name: str) -> NDArray[np.int8]:
     unknown = [word for word in words if word not in known]
     if unknown:
         raise EgolocError(f"{name}: expected one of {', '.join(known)}, got {unknown[0]!r}")
-    codes = np.array([known[word] for word in words], np.int8)
+    codes: NDArray[np.int8] = np.array([known[word] for word in words], np.int8)
     places = _numbers(array.indices, name)
     if len(places) and not (places.min() >= 0 and places.max() < len(codes)):
         raise EgolocError(f"{name}: expected words of its dictionary")
-    return codes[places]
+    found: NDArray[np.int8] = codes[places]
+    return found

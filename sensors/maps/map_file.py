@@ -37,7 +37,7 @@ class _Tile(NamedTuple):
     def size(self) -> int:
         """Bytes of memory."""
         columns = (getattr(part, name) for part in self[:2] for name in part.__slots__)
-        return self.boxes.nbytes + sum(column.nbytes for column in columns)
+        return int(self.boxes.nbytes) + sum(int(column.nbytes) for column in columns)
 
 
 class MapFile:
@@ -178,12 +178,14 @@ def _within(boxes: Floats, x: float, y: float, radius: float) -> NDArray[np.bool
     """(N,) whether a box comes within radius of a place."""
     dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
     dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)
-    return dx * dx + dy * dy <= radius * radius
+    near: NDArray[np.bool_] = dx * dx + dy * dy <= radius * radius
+    return near
 
 
 def _closer(p: Floats, x: float, y: float, radius: float) -> NDArray[np.bool_]:
     dx, dy = p[:, 0] - x, p[:, 1] - y
-    return dx * dx + dy * dy <= radius * radius
+    near: NDArray[np.bool_] = dx * dx + dy * dy <= radius * radius
+    return near
 
 
 def _all_elements(parts: Sequence[Elements]) -> Elements:

@@ -44,7 +44,8 @@ def bytes_from_normals(normal: Floats) -> Bytes:
     x, y = np.stack((x, y)) * np.where(z < 0.0, -1.0, 1.0) / np.abs(normal).sum(axis=1)
     # of the upper half, |x| + |y| <= 1: a square on its corner, turned so that it fills the range
     uv = np.stack((x + y, x - y), axis=-1)
-    return (np.rint(NORMAL_STEPS * uv) + NORMAL_STEPS).astype(np.uint8)
+    codes: Bytes = (np.rint(NORMAL_STEPS * uv) + NORMAL_STEPS).astype(np.uint8)
+    return codes
 
 
 def normals_from_bytes(codes: Bytes) -> Floats:
@@ -52,7 +53,8 @@ def normals_from_bytes(codes: Bytes) -> Floats:
     u, v = (codes.T.astype(np.float64) - NORMAL_STEPS) / NORMAL_STEPS
     x, y = (u + v) / 2.0, (u - v) / 2.0
     z = np.maximum(1.0 - np.maximum(np.abs(u), np.abs(v)), 0.0)
-    return np.stack((x, y, z), axis=-1) / np.sqrt(x * x + y * y + z * z)[:, None]
+    normal: Floats = np.stack((x, y, z), axis=-1) / np.sqrt(x * x + y * y + z * z)[:, None]
+    return normal
 
 
 def bytes_from_ratios(ratios: Floats) -> Bytes:
@@ -64,7 +66,8 @@ def bytes_from_ratios(ratios: Floats) -> Bytes:
     if wrong.any():
         row = int(np.argmax(wrong.any(axis=1)))
         raise EgolocError(f"Surfels.ratios: expected 0..1, got {ratios[wrong][0]:.6g} in row {row}")
-    return np.rint(RATIO_STEPS * np.sqrt(np.clip(ratios, 0.0, 1.0))).astype(np.uint8)
+    codes: Bytes = np.rint(RATIO_STEPS * np.sqrt(np.clip(ratios, 0.0, 1.0))).astype(np.uint8)
+    return codes
 
 
 def ratios_from_bytes(codes: Bytes) -> Floats:

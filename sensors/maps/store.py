@@ -121,9 +121,9 @@ def _check(vector_map: VectorMap) -> None:
         row = int(np.searchsorted(elements.first, vertex, side="right")) - 1
         named = elements.name[row] or f"element {row}"
         raise EgolocError(f"{named}: expected coordinates within 21,474 km, got {elements.xyz[vertex]}")
-    row = _too_far(np.column_stack((surfels.p, surfels.z)))
-    if row is not None:
-        raise EgolocError(f"surfel {row}: expected coordinates within 21,474 km, got {surfels.p[row]}")
+    surfel = _too_far(np.column_stack((surfels.p, surfels.z)))
+    if surfel is not None:
+        raise EgolocError(f"surfel {surfel}: expected coordinates within 21,474 km, got {surfels.p[surfel]}")
 
 
 def _too_far(metres: NDArray[np.float64]) -> int | None:

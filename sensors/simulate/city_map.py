@@ -105,7 +105,7 @@ def _lines(streets: _Streets, begin: Floats, end: Floats) -> list[_Block]:
     counts = np.ceil((end - begin) / SPACING_M).astype(np.intp) + 1
     row = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     s = np.repeat(begin, counts) + row * np.repeat((end - begin) / (counts - 1), counts)
-    return [_Block(*look, counts, streets.points(s, offset)) for *look, offset in LINES]
+    return [_Block(kind, style, colour, counts, streets.points(s, left)) for kind, style, colour, left in LINES]
 
 
 def _junctions(streets: _Streets, begin: Floats, end: Floats) -> list[_Block]:
@@ -172,7 +172,7 @@ def _surfels(streets: _Streets, rng: Rng) -> Surfels:
     sort = np.repeat((0, 1, 2), (ground, wall, clutter))
     offset = side * np.choose(sort, (rng.uniform(0.0, 9.0, len(s)), house, rng.uniform(7.0, 18.0, len(s))))
     place = streets.points(s, offset)
-    place[:, 2] += np.choose(sort, (0.0, rng.uniform(0.5, 8.0, len(s)), rng.uniform(0.2, 5.0, len(s))))
+    place[:, 2] += np.choose(sort, (np.zeros(len(s)), rng.uniform(0.5, 8.0, len(s)), rng.uniform(0.2, 5.0, len(s))))
     place += rng.normal(0.0, 0.02, place.shape)
     cos, sin = streets.course(s)
     level = np.stack((0.0 * sin, 0.0 * sin, 1.0 + 0.0 * sin), axis=-1)
