@@ -73,16 +73,15 @@ class RoadSurface:
         return np.column_stack((t * cos - height * sin, t * sin + height * cos))
 
     def placed(self, s: Floats, lateral: Floats, height: Floats) -> Floats:
-        """(n, 3) x, y, z of points at s, level distance to the left and height above the reference line, all (n,)."""
-        x, y, heading = self.plan.at(s).T
-        return np.column_stack(
-            (x - np.sin(heading) * lateral, y + np.cos(heading) * lateral, self.elevation.at(s) + height)
-        )
+        """(n, C, 3) x, y, z at s (n,), level distance to the left and height above the reference line (n, C), m."""
+        x, y, heading = self.plan.at(s).T[:, :, None]
+        height = self.elevation.at(s)[:, None] + height
+        return np.stack((x - np.sin(heading) * lateral, y + np.cos(heading) * lateral, height), axis=-1)
 
     def points(self, s: Floats, t: Floats, height: Floats) -> Floats:
         """(n, 3) x, y, z of points (s, t), height above the surface there, m."""
-        lateral, lift = self.section(s, t).T
-        return self.placed(s, lateral, lift + height)
+        lateral, lift = self.section(s, t)[:, :, None].swapaxes(0, 1)
+        return self.placed(s, lateral, lift + height[:, None])[:, 0]
 
     @property
     def breaks(self) -> Floats:
