@@ -59,8 +59,9 @@ def placed(
 ) -> tuple[MapFrame, Callable[[Floats], Floats]]:
     """The map's frame, and what brings the file's coordinates (N, 3) into it.
 
-    xyz: (N, 3) the file's coordinates. frame None: the file's own UTM zone, else that of its middle; without a georeference a
-    local plane whose datum is not known (0, 0). Raises EgolocError where the file cannot be brought into frame.
+    xyz: (N, 3) the file's coordinates. frame None: the file's own UTM zone, else that of its middle; without a
+    georeference a local plane whose datum is not known (0, 0). Raises EgolocError where the file cannot be brought
+    into frame.
     """
     if reference is None:
         if frame is not None:

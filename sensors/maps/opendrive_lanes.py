@@ -108,11 +108,11 @@ def _breaks(road: Road, section: Section) -> Floats:
 
 
 def _add_marks(road: Road, section: Section, lane: Lane, s: Floats, border: Floats, builder: Builder) -> None:
-    ends = [start for start, _ in lane.marks[1:]] + [section.end]
-    for (start, mark), end in zip(lane.marks, ends, strict=True):
+    ends = (min(start, section.end) for start in [*(start for start, _ in lane.marks[1:]), section.end])
+    for (start, mark), end in zip(lane.marks, ends, strict=False):  # without marks the section's end alone
         if mark.get("type", "none") == "none" or (start < end <= section.start):
             continue
-        chosen = (s >= start) & (s <= min(end, section.end))
+        chosen = (s >= start) & (s <= end)
         if chosen.sum() < 2:
             builder.leave_out("road marks without length")
             continue
@@ -162,7 +162,7 @@ def _edges(road: Road, section: Section, s: Floats, builder: Builder) -> Iterato
 
 def _transitions(lanes: list[Lane]) -> Iterator[tuple[int, Lane | None]]:
     """Edges on one side, from the middle outwards: the lane inside of each, and the lane that is no road if any."""
-    for inner, outer in zip(lanes, [*lanes[1:], None], strict=True):
+    for inner, outer in zip(lanes, [*lanes[1:], None], strict=False):
         beyond = outer is not None and _is_road(outer)
         if _is_road(inner) != beyond and (outer is not None or _is_road(inner)):
             yield inner.id, outer if _is_road(inner) else inner

@@ -155,7 +155,7 @@ def _sections(road: Element, length: float, builder: Builder) -> Iterable[Sectio
     starts = [number(e, "s") for e in elements]
     offset = cubics(road.findall("lanes/laneOffset"))
     sides: dict[str, tuple[Lane, ...]] = {"left": (), "right": ()}
-    for element, start, after in zip(elements, starts, [*starts[1:], length], strict=True):
+    for element, start, after in zip(elements, starts, [*starts[1:], length], strict=False):
         one_sided = element.get("singleSide", "false") in {"true", "1"}
         for side in sides:
             if not one_sided or element.find(side) is not None:
