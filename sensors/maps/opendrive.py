@@ -30,6 +30,9 @@ NOT_TAKEN = {
     "station": "stations",
 }
 
+ON_EARTH_M = 2e7
+"""Half the way around the earth: no projection goes farther."""
+
 
 def read(path: Path, frame: MapFrame | None = None) -> tuple[VectorMap, tuple[LeftOut, ...]]:
     """Import a file; road_km is the length of roads with driving lanes, the roads within junctions not counted.
@@ -82,6 +85,10 @@ def _in_frame(
     shifted = _shift(root.find("header/offset"))
     local = builder.built(MapFrame("enu"), road_km=road_km)
     world = shifted(local.elements.xyz)
+    off = np.abs(world).max(axis=1) > ON_EARTH_M
+    if off.any():
+        name = local.elements.name[np.searchsorted(local.elements.first, off.argmax(), side="right") - 1]
+        raise EgolocError(f"{path}: {name}: expected coordinates within {ON_EARTH_M / 1e3:.0f} km, got {world[off][0]}")
     target, to_map = placed(reference, world, frame, path)
     elements = replace(local.elements, xyz=to_map(world) if len(world) else world)
     return replace(local, frame=target, elements=elements), builder.left_out

@@ -1,6 +1,7 @@
 """Lane borders of an OpenDRIVE road: its painted lines, and the edges between what is road and what is not."""
 
 from collections.abc import Iterator
+from functools import partial
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -50,7 +51,7 @@ def add_lanes(road: Road, builder: Builder) -> None:
     """Every painted line and every edge of a road, section by section."""
     for section in road.sections:
         lanes = (section.centre, *section.left, *section.right)
-        s = refined(lambda s, part=section: _borders(road, part, s), _breaks(road, section))  # type: ignore[misc]
+        s = refined(partial(_borders, road, section), _breaks(road, section))
         borders = _borders(road, section, s)
         for row, lane in enumerate(lanes):
             _add_marks(road, section, lane, s, borders[:, row], builder)

@@ -13,14 +13,14 @@ STRAIGHT_M = 0.008
 """Vertices this close to the line through those kept are dropped: 9 mm in all."""
 SHORTEST_M = 0.01
 """Where a curve jumps (a lane that begins with a width) halving ends here."""
-MAX_SAMPLES = 1_000_000
+MAX_SAMPLES = 200_000
 
 
 def refined(curves: Callable[[Floats], Floats], breaks: Floats) -> Floats:
     """(n,) rising parameters at which the chords of all curves are within CHORD_M of them.
 
     curves: gives (n, C, 3) points at parameters (n,) in m; breaks: rising parameters between which they are smooth.
-    Raises EgolocError where a curve bends so wildly that a million vertices do not follow it.
+    Raises EgolocError where a curve bends so wildly that MAX_SAMPLES vertices do not follow it.
     """
     low, high, kept = breaks[:-1], breaks[1:], [breaks]
     while len(low):

@@ -67,7 +67,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         hardened_xml.parse(tmp_path / "nowhere.xodr")
 
 
-@pytest.mark.parametrize("text", ["nan", "inf", "-1e999", "1,5", ""])
+@pytest.mark.parametrize("text", ["nan", "inf", "-1e999", "-1e13", "1,5", ""])
 def test_a_number_that_is_none_is_named(tmp_path: Path, text: str) -> None:
     root = hardened_xml.parse(_written(tmp_path, f'<a>\n<b x="{text}"/></a>'))
     with pytest.raises(EgolocError, match=r"map\.xml: line 2: <b>: x: expected a finite number, got"):

@@ -114,6 +114,8 @@ def test_pieces_without_length_are_counted(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ('x="0"', 'x="nan"', r"line 4: <geometry>: x: expected a finite number, got 'nan'"),
+        ('y="0"', 'y="3e7"', r"road 1 lane -1 s 0\.0: expected coordinates within 20000 km, got \["),
+        ('y="0"', 'y="3e13"', "line 4: <geometry>: y: expected a finite number, got '3e13'"),
         ('hdg="0" ', "", "line 4: <geometry>: expected the attribute hdg"),
         ('length="100"><line', 'length="-5"><line', r"line 4: <geometry>: length: expected 0\.\.1000000 m, got -5"),
         (
