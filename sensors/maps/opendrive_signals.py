@@ -31,9 +31,9 @@ NAMED = (
     (("crosswalk", "crossing", "zebra"), Kind.CROSSING, Style.UNKNOWN),
     (("arrow",), Kind.MARKING, Style.ARROW),
     (("stencil", "roadmark", "sgrm"), Kind.MARKING, Style.UNKNOWN),
+    (("pole", "lamp", "streetlight", "street_light", "street light"), Kind.POLE, Style.UNKNOWN),
     (("light", "signal"), Kind.SIGN, Style.LIGHT),
     (("sign",), Kind.SIGN, Style.UNKNOWN),
-    (("pole", "post"), Kind.POLE, Style.UNKNOWN),
 )
 CROSSING_TYPE = "1000003"
 STANDING_M = 1.5

@@ -11,6 +11,8 @@ from pyproj import Transformer
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame, llh_from_map
 from sensors.maps import opendrive
+from sensors.maps.builder import Builder
+from sensors.maps.opendrive_road import read_road
 from sensors.maps.vector_map import Kind, Style
 from tests.sensors.maps.xodr import LINE, RIGHT, counts, imported, road, section, written
 
@@ -41,6 +43,22 @@ def test_a_real_file_loses_no_known_kind(data: Path, name: str) -> None:
     driven = [e for e in outside if e.find("lanes//lane[@type='driving']") is not None]
     assert vector_map.road_km == pytest.approx(sum(float(e.get("length", "nan")) for e in driven) / 1e3, abs=1e-6)
     assert not [row for row in left_out if row.reason.startswith(("signals", "objects", "road marks", "crossings"))]
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_pieces_of_real_roads_end_where_the_next_begin(data: Path, name: str) -> None:
+    """The file's own places and headings, computed by the tool that drew it: lines, arcs, spirals, paramPoly3."""
+    roads = ElementTree.parse(data / f"maps/opendrive/{name}.xodr").getroot().iter("road")
+    joints = 0
+    for element in roads:
+        read = read_road(element, Builder("test"))
+        assert read is not None
+        plan = read.surface.plan
+        before = plan.at(plan.s[1:] - 1e-9)
+        np.testing.assert_allclose(before[:, :2], np.column_stack((plan.x, plan.y))[1:], atol=2e-3)
+        np.testing.assert_allclose(np.cos(before[:, 2] - plan.heading[1:]), 1.0, atol=1e-6)
+        joints += len(before)
+    assert joints > 5
 
 
 def test_a_real_file_joins_up(data: Path) -> None:

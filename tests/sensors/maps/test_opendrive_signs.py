@@ -151,6 +151,8 @@ def test_poles_boxes_and_stop_lines_without_outline(tmp_path: Path) -> None:
         'type="roadMark" subtype="text"': (Kind.MARKING, Style.UNKNOWN, 1),
         'type="pole" subtype="lamp"': (Kind.POLE, Style.UNKNOWN, 1),
         'type="none" name="StopLine 3" length="0.2" width="3.5"': (Kind.STOP_LINE, Style.SOLID, 2),
+        'type="-1" name="StreetLight_2" height="6"': (Kind.POLE, Style.UNKNOWN, 2),
+        'type="-1" name="TrafficLight_2" height="6"': (Kind.SIGN, Style.LIGHT, 1),
     }
     for attributes, expected in boxes.items():
         found, _ = _taken(tmp_path, _object(f'{attributes} s="50" t="0"'))
