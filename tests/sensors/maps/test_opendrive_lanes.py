@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sensors.maps.vector_map import Colour, Floats, Kind, Style
-from tests.sensors.maps.xodr import ARC, RIGHT, WIDTH, imported, only, road, section
+from tests.sensors.maps.xodr import ARC, LINE, RIGHT, WIDTH, imported, only, road, section
 
 
 def test_borders_of_a_curved_road_with_changing_widths(tmp_path: Path) -> None:
@@ -136,3 +136,40 @@ def test_edges_stand_where_the_road_ends(tmp_path: Path) -> None:
     assert _edges(tmp_path, walk, 'id="1" junction="5"') == [(3.5, curb)]
     assert _edges(tmp_path, RIGHT, 'id="1" junction="5"') == []
     assert _edges(tmp_path, f"<left>{lane(1, 'sidewalk')}</left>{RIGHT}") == [(-3.5, edge), (0.0, edge)]
+
+
+def test_a_lane_offset_that_jumps_between_sections_bends_no_line(tmp_path: Path) -> None:
+    offset = '<laneOffset s="0" a="0" b="0" c="0" d="0"/><laneOffset s="50" a="3.5" b="0" c="0" d="0"/>'
+    lines = only(imported(tmp_path, road(offset + section(RIGHT) + section(RIGHT, 50.0)))[0], Kind.LANE_LINE).elements
+    ends = [lines.vertices(row)[:, :2].tolist() for row in range(len(lines))]
+    np.testing.assert_allclose(ends, [[[0, -3.5], [50, -3.5]], [[50, 0], [100, 0]]], atol=1e-9)
+
+
+def test_a_parametric_cubic_is_read_by_length_or_by_share(tmp_path: Path) -> None:
+    """The same curve twice: u = s - 1e-5 s^3, v = 0.01 s^2 over 100 m."""
+    forms = {
+        "arcLength": 'aU="0" bU="1" cU="0" dU="-1e-5" aV="0" bV="0" cV="0.01" dV="0"',
+        "normalized": 'aU="0" bU="100" cU="0" dU="-10" aV="0" bV="0" cV="100" dV="0"',
+    }
+    for span, coefficients in forms.items():
+        geometry = LINE.replace("<line/>", f'<paramPoly3 pRange="{span}" {coefficients}/>')
+        mark = '<center><lane id="0" type="none"><roadMark sOffset="0" type="solid"/></lane></center>'
+        line = only(imported(tmp_path, road(section(mark), geometry))[0], Kind.LANE_LINE).elements.vertices(0)
+        s = np.sqrt(line[:, 1] / 0.01)
+        assert len(line) > 10
+        np.testing.assert_allclose(line[:, 0], s - 1e-5 * s**3, atol=1e-6)
+        np.testing.assert_allclose(line[-1], [90, 100, 0], atol=1e-9)
+
+
+def test_crossfall_and_shape_lower_the_paint_of_their_side(tmp_path: Path) -> None:
+    both = RIGHT + RIGHT.replace("right", "left").replace("-1", "1")
+    fall = '<lateralProfile><crossfall side="right" s="0" a="0.02" b="0" c="0" d="0"/></lateralProfile>'
+    lines = only(imported(tmp_path, road(section(both), more=fall))[0], Kind.LANE_LINE).elements
+    heights = {lines.vertices(row)[0, 1]: lines.vertices(row)[0, 2] for row in range(2)}
+    assert heights == pytest.approx({-3.5: -3.5 * np.tan(0.02), 3.5: 0.0})
+    roof = '<shape s="0" t="-4" a="0" b="0.1" c="0" d="0"/><shape s="0" t="0" a="0.4" b="-0.05" c="0" d="0"/>'
+    lines = only(
+        imported(tmp_path, road(section(both), more=f"<lateralProfile>{roof}</lateralProfile>"))[0], Kind.LANE_LINE
+    ).elements
+    heights = {lines.vertices(row)[0, 1]: lines.vertices(row)[0, 2] for row in range(2)}
+    assert heights == pytest.approx({-3.5: 0.05, 3.5: 0.4 - 0.175})
