@@ -1,0 +1,61 @@
+"""Where a source's coordinates come to lie in a map: geodetic ones in a frame asked for or of the place, local ones."""
+
+import numpy as np
+
+from sensors.errors import EgolocError
+from sensors.geodesy import Floats, MapFrame, map_from_llh, utm_frame
+
+LOCAL = MapFrame("enu")
+"""The plane of a source without georeference. Its datum, 0, 0, says nothing."""
+MAX_FROM_MERIDIAN_DEG = 3.5
+"""A UTM zone reaches 3 deg from its central meridian; maps overlap into the next one by half a degree."""
+MAX_FROM_DATUM_M = 100e3
+"""A tangent plane: at this distance the earth has fallen away by 780 m."""
+
+
+def placed(where: str, llh: Floats, frame: MapFrame | None) -> tuple[MapFrame, Floats]:
+    """A frame and (N, 3) coordinates in it of (N, 3) rad, rad, m; heights may be NaN and stay so.
+
+    where: the file, for messages. frame None: the UTM frame of the points' middle. Raises EgolocError for points off
+    the earth, and for a frame that is another place's.
+    """
+    if not len(llh):
+        return frame or LOCAL, np.empty((0, 3))
+    off_earth = ~((np.abs(llh[:, 0]) <= np.pi / 2) & (np.abs(llh[:, 1]) <= 2 * np.pi))
+    if off_earth.any():
+        lat, lon, _ = np.degrees(llh[np.argmax(off_earth)])
+        raise EgolocError(f"{where}: expected latitude and longitude in degrees, got {lat:.7g}, {lon:.7g}")
+    middle = np.append(np.median(llh[:, :2], axis=0), 0.0)
+    frame = frame or utm_frame(middle)
+    _refuse_other_zone(where, llh, frame)
+    xyz = map_from_llh(frame, np.column_stack((llh[:, :2], _heights(llh[:, 2], frame))))
+    xyz[np.isnan(llh[:, 2]), 2] = np.nan
+    distance = np.hypot(*xyz[:, :2].T).max()
+    if frame.kind == "enu" and distance > MAX_FROM_DATUM_M:
+        raise EgolocError(f"{where}: the map asked for is another place's: {distance / 1e3:.0f} km from its datum")
+    return frame, xyz
+
+
+def refuse_frame(where: str, frame: MapFrame | None) -> None:
+    """Refuse to bring local coordinates into a frame on the earth."""
+    if frame is not None:
+        raise EgolocError(f"{where}: has only local coordinates, without georeference: cannot be brought into a map frame")
+
+
+def _refuse_other_zone(where: str, llh: Floats, frame: MapFrame) -> None:
+    if frame.kind != "utm":
+        return
+    lon = np.degrees(llh[:, 1])
+    away = np.abs((lon - (6.0 * frame.zone - 183.0) + 180.0) % 360.0 - 180.0)
+    south = np.median(llh[:, 0]) < 0
+    if away.max() > MAX_FROM_MERIDIAN_DEG or frame.south != south:
+        zone = int((lon[np.argmax(away)] + 180.0) // 6.0) % 60 + 1
+        asked = f"zone {frame.zone}{'S' if frame.south else 'N'}"
+        raise EgolocError(f"{where}: lies in UTM zone {zone}{'S' if south else 'N'}, the map asked for is in {asked}")
+
+
+def _heights(heights: Floats, frame: MapFrame) -> Floats:
+    """Heights with those that are not known filled in: a plane's x and y need one, a metre of it is 0.2 mm at 1 km."""
+    known = heights[np.isfinite(heights)]
+    usual = float(np.median(known)) if len(known) else frame.origin[2]
+    return np.where(np.isnan(heights), usual, heights)
