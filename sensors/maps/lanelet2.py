@@ -164,7 +164,9 @@ class _Importer:
         if what == "pedestrian_marking" and way.nodes[0] == way.nodes[-1]:
             style = Style.ZEBRA  # a stripe's outline
         if style is None:
-            self.builder.leave_out(f"subtypes {way.tags['subtype']} of {what}: not known, the line is taken without style")
+            self.builder.leave_out(
+                f"subtypes {way.tags['subtype']} of {what}: not known, the line is taken without style"
+            )
         if colour is None:
             self.builder.leave_out("colours that are not known: the line is taken without")
         self.builder.add(kind, xyz, style or Style.UNKNOWN, colour or Colour.UNKNOWN, name)
@@ -176,7 +178,9 @@ class _Importer:
         except ValueError:
             height = -1.0
         if height < 0 or np.isinf(height):
-            raise EgolocError(f"{self.builder.source}: way {way.id}: height: expected metres, got {way.tags['height']!r}")
+            raise EgolocError(
+                f"{self.builder.source}: way {way.id}: height: expected metres, got {way.tags['height']!r}"
+            )
         return height
 
     def _crossings(self) -> None:

@@ -28,5 +28,5 @@ def pole(xyz: Floats, height: float) -> Floats:
         if top[2] > foot[2]:
             return np.array((foot, top))
         if height > 0:
-            return np.array((foot, foot + (0.0, 0.0, height)))
+            return np.array((foot, foot + np.array((0.0, 0.0, height))))
     return np.atleast_2d(foot)

@@ -1,7 +1,7 @@
 """What Lanelet2's and Autoware's tags are in a map: kinds and styles by type and subtype, and what is no element.
 
-Source: Lanelet2's LinestringTagging, Autoware's format extension. Of ``solid_dashed`` and its reverse, the first word is
-the left line: the page's table was once the other way round, and only this agrees with its lane changes.
+Source: Lanelet2's LinestringTagging, Autoware's format extension. Of ``solid_dashed`` and its reverse, the first word
+is the left line: the page's table was once the other way round, and only this agrees with its lane changes.
 """
 
 from sensors.maps.osm import Tags

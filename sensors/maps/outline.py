@@ -46,7 +46,8 @@ def _split(ring: Floats, others: list[Floats]) -> Floats:
     t = np.unique(np.concatenate(along))
     edge = np.minimum(t.astype(np.int64), len(ring) - 2)
     part = (t - edge)[:, None]
-    return ring[edge] * (1.0 - part) + ring[edge + 1] * part
+    split: Floats = ring[edge] * (1.0 - part) + ring[edge + 1] * part
+    return split
 
 
 def _crossings(ring: Floats, other: Floats) -> Floats:

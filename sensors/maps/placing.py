@@ -3,7 +3,7 @@
 import numpy as np
 
 from sensors.errors import EgolocError
-from sensors.geodesy import Floats, MapFrame, map_from_llh, utm_frame
+from sensors.geodesy import Floats, MapFrame, llh_from_map, map_from_llh, utm_frame
 
 LOCAL = MapFrame("enu")
 """The plane of a source without georeference. Its datum, 0, 0, says nothing."""
@@ -11,6 +11,9 @@ MAX_FROM_MERIDIAN_DEG = 3.5
 """A UTM zone reaches 3 deg from its central meridian; maps overlap into the next one by half a degree."""
 MAX_FROM_DATUM_M = 100e3
 """A tangent plane: at this distance the earth has fallen away by 780 m."""
+
+PASSES = 3
+"""Towards the height of a point of a plane: each makes the rest smaller by the square of its slope."""
 
 
 def placed(where: str, llh: Floats, frame: MapFrame | None) -> tuple[MapFrame, Floats]:
@@ -39,7 +42,9 @@ def placed(where: str, llh: Floats, frame: MapFrame | None) -> tuple[MapFrame, F
 def refuse_frame(where: str, frame: MapFrame | None) -> None:
     """Refuse to bring local coordinates into a frame on the earth."""
     if frame is not None:
-        raise EgolocError(f"{where}: has only local coordinates, without georeference: cannot be brought into a map frame")
+        raise EgolocError(
+            f"{where}: has only local coordinates, without georeference: cannot be brought into a map frame"
+        )
 
 
 def _refuse_other_zone(where: str, llh: Floats, frame: MapFrame) -> None:
@@ -54,8 +59,18 @@ def _refuse_other_zone(where: str, llh: Floats, frame: MapFrame) -> None:
         raise EgolocError(f"{where}: lies in UTM zone {zone}{'S' if south else 'N'}, the map asked for is in {asked}")
 
 
+def geodetic(frame: MapFrame, xyz: Floats) -> Floats:
+    """(N, 3) rad, rad, m of (N, 3) map coordinates: the way back of ``placed``, with heights that may be NaN."""
+    known = np.isfinite(xyz[:, 2])
+    filled = np.where(known, xyz[:, 2], 0.0)
+    llh = llh_from_map(frame, np.column_stack((xyz[:, :2], filled)))
+    for _ in range(PASSES):  # a plane's z at the datum's height depends on the place, and the place a little on z
+        filled = np.where(known, filled, filled - (llh[:, 2] - frame.origin[2]))
+        llh = llh_from_map(frame, np.column_stack((xyz[:, :2], filled)))
+    llh[~known, 2] = np.nan
+    return llh
+
+
 def _heights(heights: Floats, frame: MapFrame) -> Floats:
-    """Heights with those that are not known filled in: a plane's x and y need one, a metre of it is 0.2 mm at 1 km."""
-    known = heights[np.isfinite(heights)]
-    usual = float(np.median(known)) if len(known) else frame.origin[2]
-    return np.where(np.isnan(heights), usual, heights)
+    """Heights with the datum's where not known: a plane's x and y need one, and 1 m of it is 0.2 mm at 1 km."""
+    return np.where(np.isnan(heights), frame.origin[2], heights)
