@@ -181,7 +181,7 @@ def _add_areas(path: Path, areas: Mapping[str, _Area], builder: Builder) -> None
     parts = outlines(rings)
     whole = {index for index, part in parts if part is rings[index]}
     if len(whole) < len(rings):
-        reason = "drivable areas: stretches of the outline that lie inside another one are no edge of the road"
+        reason = "drivable areas: stretches of the outline between two of them are no edge of the road"
         builder.leave_out(reason, len(rings) - len(whole))
     for index, part in parts:
         builder.add(Kind.ROAD_BOUNDARY, part, name=names[index])

@@ -1,26 +1,37 @@
-"""The outline of overlapping areas: of each one's ring, what lies in no other."""
+"""The outline of areas that overlap or adjoin: of each one's ring, what has none of them on one of its sides."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sensors.geodesy import Floats
 
+SEAM_M = 0.1
+"""Areas that are nearer than this to each other adjoin."""
+
 
 def outlines(rings: list[Floats]) -> list[tuple[int, Floats]]:
-    """Polylines (n, 3) of the rings' parts that lie in no other ring, each with its ring's index.
+    """Polylines (n, 3) of the rings' parts that have areas on one side only, each with its ring's index.
 
-    rings: closed, (n, 3), the last vertex the first again; a ring of which nothing lies in another comes back whole.
-    Two rings' common edge runs in neither, and stays in both.
+    rings: closed, (n, 3), the last vertex the first again; one that no other overlaps or adjoins comes back whole.
     """
     result = []
     for index, ring in enumerate(rings):
         others = [other for i, other in enumerate(rings) if i != index and _boxes_meet(ring, other)]
         split = _split(ring, others)
-        middles = 0.5 * (split[:-1, :2] + split[1:, :2])
-        hidden = np.zeros(len(middles), bool)
-        for other in others:
-            hidden |= inside(middles, other)
+        hidden = _within(split, [ring, *others])
         result += [(index, part) for part in _parts(split, hidden)] if hidden.any() else [(index, ring)]
+    return result
+
+
+def _within(ring: Floats, areas: list[Floats]) -> NDArray[np.bool_]:
+    """(edges,) whether an edge has areas on both sides."""
+    along = np.diff(ring[:, :2], axis=0)
+    across = np.column_stack((-along[:, 1], along[:, 0])) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    middle = 0.5 * (ring[:-1, :2] + ring[1:, :2])
+    left, right = (
+        np.any([inside(middle + offset * across, area) for area in areas], axis=0) for offset in (SEAM_M, -SEAM_M)
+    )
+    result: NDArray[np.bool_] = left & right
     return result
 
 
@@ -37,13 +48,14 @@ def inside(points: Floats, ring: Floats) -> NDArray[np.bool_]:
 
 def _boxes_meet(one: Floats, other: Floats) -> bool:
     low = np.maximum(one[:, :2].min(axis=0), other[:, :2].min(axis=0))
-    return bool((low <= np.minimum(one[:, :2].max(axis=0), other[:, :2].max(axis=0))).all())
+    high = np.minimum(one[:, :2].max(axis=0), other[:, :2].max(axis=0))
+    return bool((low <= high + SEAM_M).all())
 
 
 def _split(ring: Floats, others: list[Floats]) -> Floats:
-    """The ring with vertices added wherever it crosses another one."""
-    along = [np.arange(len(ring), dtype=np.float64), *(_crossings(ring, other) for other in others)]
-    t = np.unique(np.concatenate(along))
+    """The ring with vertices added wherever it crosses another one, or passes one's vertex within a seam."""
+    along = [part for other in others for part in (_crossings(ring, other), _passed(ring, other))]
+    t = np.unique(np.concatenate((np.arange(len(ring)), *along)))
     edge = np.minimum(t.astype(np.int64), len(ring) - 2)
     part = (t - edge)[:, None]
     split: Floats = ring[edge] * (1.0 - part) + ring[edge + 1] * part
@@ -61,6 +73,15 @@ def _crossings(ring: Floats, other: Floats) -> Floats:
         t = (w[..., 0] * u[..., 1] - w[..., 1] * u[..., 0]) / slant
         rows, columns = np.nonzero((s > 0) & (s < 1) & (t >= 0) & (t <= 1))
     return np.asarray(rows + s[rows, columns])
+
+
+def _passed(ring: Floats, other: Floats) -> Floats:
+    """Where the ring passes vertices of another, in edges from its beginning."""
+    u = np.diff(ring[:, :2], axis=0)[:, None]
+    w = other[None, :-1, :2] - ring[:-1, None, :2]
+    along = (w * u).sum(axis=2) / np.maximum((u * u).sum(axis=2), 1e-12)
+    rows, columns = np.nonzero((along > 0) & (along < 1) & (np.linalg.norm(w - along[..., None] * u, axis=2) < SEAM_M))
+    return np.asarray(rows + along[rows, columns])
 
 
 def _parts(ring: Floats, hidden: NDArray[np.bool_]) -> list[Floats]:
