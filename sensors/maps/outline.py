@@ -10,7 +10,7 @@ SEAM_M = 0.1
 
 
 def outlines(rings: list[Floats]) -> list[tuple[int, Floats]]:
-    """Polylines (n, 3) of the rings' parts that have areas on one side only, each with its ring's index.
+    """Polylines (n, 3) of the rings' parts that have areas on one side only, each with its ring's index; once.
 
     rings: closed, (n, 3), the last vertex the first again; one that no other overlaps or adjoins comes back whole.
     """
@@ -18,7 +18,8 @@ def outlines(rings: list[Floats]) -> list[tuple[int, Floats]]:
     for index, ring in enumerate(rings):
         others = [other for i, other in enumerate(rings) if i != index and _boxes_meet(ring, other)]
         split = _split(ring, others)
-        hidden = _within(split, [ring, *others])
+        earlier = [other for other in rings[:index] if _boxes_meet(ring, other)]
+        hidden = _within(split, [ring, *others]) | _repeats(split, earlier)
         result += [(index, part) for part in _parts(split, hidden)] if hidden.any() else [(index, ring)]
     return result
 
@@ -33,6 +34,17 @@ def _within(ring: Floats, areas: list[Floats]) -> NDArray[np.bool_]:
     )
     result: NDArray[np.bool_] = left & right
     return result
+
+
+def _repeats(ring: Floats, earlier: list[Floats]) -> NDArray[np.bool_]:
+    """(edges,) whether an edge lies on another ring's."""
+    middle = 0.5 * (ring[:-1, None, :2] + ring[1:, None, :2])
+    hidden = np.zeros(len(ring) - 1, bool)
+    for other in earlier:
+        u, w = np.diff(other[:, :2], axis=0), middle - other[:-1, :2]
+        along = np.clip((w * u).sum(axis=2) / np.maximum((u * u).sum(axis=1), 1e-12), 0.0, 1.0)
+        hidden |= (np.linalg.norm(w - along[..., None] * u, axis=2) < SEAM_M).any(axis=1)
+    return hidden
 
 
 def inside(points: Floats, ring: Floats) -> NDArray[np.bool_]:
