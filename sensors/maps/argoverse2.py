@@ -23,7 +23,7 @@ from sensors.maps.builder import Builder
 from sensors.maps.ground_height import ground_height
 from sensors.maps.json_text import read_json
 from sensors.maps.outline import outlines
-from sensors.maps.placing import LOCAL, geodetic, placed, refuse_frame
+from sensors.maps.placing import LOCAL, geodetic, placed, refuse_far, refuse_frame
 from sensors.maps.rings import closed, ring_of_sides
 from sensors.maps.road_length import polyline_m, road_km
 from sensors.maps.vector_map import Colour, Kind, Style, VectorMap
@@ -124,7 +124,9 @@ def _xyz(path: Path, points: list[_Point], name: str) -> Floats:
     """(n, 3) vertices, z NaN where missing."""
     if len(points) < 2:
         raise EgolocError(f"{path}: {name}: expected two points or more, got {len(points)}")
-    return np.array([(point.x, point.y, np.nan if point.z is None else point.z) for point in points])
+    xyz = np.array([(point.x, point.y, np.nan if point.z is None else point.z) for point in points])
+    refuse_far(f"{path}: {name}", xyz)
+    return xyz
 
 
 def _add_lanes(path: Path, segments: Mapping[str, _Lane], builder: Builder) -> float:

@@ -164,7 +164,7 @@ def _named(properties: dict[str, Any], key: str, names: type[E], builder: Builde
 
 
 def _parts(geometry: _Geometry | None) -> Iterator[tuple[str, list[list[float]]]]:
-    """What each part is (point, line, outline, hole, or a word for what no part can be), and its positions."""
+    """What each part is (point, line, ring, hole, or a word for what no part can be), and its positions."""
     match geometry:
         case Point(at):
             yield "point", [at]
@@ -175,9 +175,9 @@ def _parts(geometry: _Geometry | None) -> Iterator[tuple[str, list[list[float]]]
         case MultiLineString(lines):
             yield from (("line", line) for line in lines)
         case Polygon(rings):
-            yield from (("hole" if row else "outline", ring) for row, ring in enumerate(rings))
+            yield from (("hole" if row else "ring", ring) for row, ring in enumerate(rings))
         case MultiPolygon(polygons):
-            yield from (("hole" if row else "outline", ring) for rings in polygons for row, ring in enumerate(rings))
+            yield from (("hole" if row else "ring", ring) for rings in polygons for row, ring in enumerate(rings))
         case GeometryCollection():
             yield "geometry collection", []
         case _:
@@ -187,10 +187,10 @@ def _parts(geometry: _Geometry | None) -> Iterator[tuple[str, list[list[float]]]
 def _misfit(kind: Kind, what: str, positions: list[list[float]]) -> str:
     """Why a part is no element of its kind; nothing where it is one."""
     if what == "hole" and kind is not Kind.ROAD_BOUNDARY:
-        return "holes in an outline: it is taken without"
-    is_ring = what in ("outline", "hole")
+        return "holes in a ring: it is taken without"
+    is_ring = what in ("ring", "hole")
     if is_ring and positions[0] != positions[-1]:
-        return "an outline that is not closed"
+        return "a ring that is not closed"
     is_ring = is_ring or (what == "line" and len(positions) > 3 and positions[0] == positions[-1])
     fits = (
         (what == "point" and kind in _POINTS)

@@ -28,7 +28,7 @@ from sensors.maps.lanelet2_tags import (
     style_of,
 )
 from sensors.maps.osm import Nodes, Osm, Relation, Way, read_osm
-from sensors.maps.placing import LOCAL, placed, refuse_frame
+from sensors.maps.placing import LOCAL, placed, refuse_far, refuse_frame
 from sensors.maps.rings import closed, ring_of_sides
 from sensors.maps.road_length import polyline_m, road_km
 from sensors.maps.vector_map import Colour, Kind, Style, VectorMap
@@ -70,6 +70,7 @@ def _coordinates(path: Path, osm: Osm, frame: MapFrame | None, builder: Builder)
         frame, xyz[rows] = placed(str(path), llh, frame)
         return frame, xyz
     refuse_frame(str(path), frame)
+    refuse_far(str(path), np.column_stack((nodes.local[rows], nodes.height[rows])))
     if real.any():
         builder.leave_out("latitudes and longitudes that do not fit local_x and local_y", int(real.sum()))
     xyz[rows] = np.column_stack((nodes.local[rows], nodes.height[rows]))

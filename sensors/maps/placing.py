@@ -12,6 +12,8 @@ MAX_FROM_MERIDIAN_DEG = 3.5
 MAX_FROM_DATUM_M = 100e3
 """A tangent plane: at this distance the earth has fallen away by 780 m."""
 
+MAX_M = 1e7
+"""Of local coordinates and heights: from the equator to a pole."""
 PASSES = 3
 """Towards the height of a point of a plane: each makes the rest smaller by the square of its slope."""
 
@@ -28,8 +30,9 @@ def placed(where: str, llh: Floats, frame: MapFrame | None) -> tuple[MapFrame, F
     if off_earth.any():
         lat, lon, _ = np.degrees(llh[np.argmax(off_earth)])
         raise EgolocError(f"{where}: expected latitude and longitude in degrees, got {lat:.7g}, {lon:.7g}")
-    middle = np.append(np.median(llh[:, :2], axis=0), 0.0)
-    frame = frame or utm_frame(middle)
+    refuse_far(where, llh[:, 2:])
+    if frame is None:
+        frame = _own_frame(where, llh)
     _refuse_other_zone(where, llh, frame)
     xyz = map_from_llh(frame, np.column_stack((llh[:, :2], _heights(llh[:, 2], frame))))
     xyz[np.isnan(llh[:, 2]), 2] = np.nan
@@ -37,6 +40,27 @@ def placed(where: str, llh: Floats, frame: MapFrame | None) -> tuple[MapFrame, F
     if frame.kind == "enu" and distance > MAX_FROM_DATUM_M:
         raise EgolocError(f"{where}: the map asked for is another place's: {distance / 1e3:.0f} km from its datum")
     return frame, xyz
+
+
+def _own_frame(where: str, llh: Floats) -> MapFrame:
+    """The UTM frame of the points' middle."""
+    lat, lon = np.median(llh[:, :2], axis=0)
+    if np.abs(llh[:, 1] - lon).max() > np.radians(MAX_FROM_MERIDIAN_DEG):
+        wide = np.degrees(np.ptp(llh[:, 1]))
+        raise EgolocError(
+            f"{where}: expected a map within one UTM zone, got one that is {wide:.1f} deg of longitude wide"
+        )
+    try:
+        return utm_frame((lat, lon, 0.0))
+    except EgolocError as error:
+        raise EgolocError(f"{where}: {error}") from error
+
+
+def refuse_far(where: str, metres: Floats) -> None:
+    """Refuse local coordinates or heights that are no metres of a place on the earth; NaN is let through."""
+    if np.abs(metres, where=np.isfinite(metres), out=np.zeros_like(metres)).max(initial=0.0) > MAX_M:
+        worst = metres.ravel()[np.nanargmax(np.abs(metres))]
+        raise EgolocError(f"{where}: expected metres within {MAX_M:.0e}, got {worst:.4g}")
 
 
 def refuse_frame(where: str, frame: MapFrame | None) -> None:

@@ -81,10 +81,10 @@ def test_geometries_become_elements(
     ("item", "reason"),
     [
         (feature("Point", A, kind="lane_line"), "lane_line: a point is none"),
-        (feature("Polygon", [RING], kind="pole"), "pole: a outline is none"),
+        (feature("Polygon", [RING], kind="pole"), "pole: a ring is none"),
         (feature("LineString", [A, B], kind="crossing"), "crossing: a line is none"),
-        (feature("Polygon", [[A, B, C, B]], kind="crossing"), "crossing: an outline that is not closed"),
-        (feature("Polygon", [RING, RING], kind="crossing"), "crossing: holes in an outline: it is taken without"),
+        (feature("Polygon", [[A, B, C, B]], kind="crossing"), "crossing: a ring that is not closed"),
+        (feature("Polygon", [RING, RING], kind="crossing"), "crossing: holes in a ring: it is taken without"),
         (feature("Point", A, kind="tree"), "features of kind tree: not known"),
         (feature("Point", A, kind="sign", style="odd"), "style odd: not known, the element is taken without"),
         (
@@ -127,6 +127,12 @@ def test_another_file_is_refused(tmp_path: Path, content: str, message: str) -> 
             feature("Point", [457000.0, 5428000.0], kind="pole", name="P"),
             r"P: expected longitude and latitude in degrees",
         ),
+        (
+            feature("MultiPoint", [A, [20.0, 49.0]], kind="pole"),
+            "expected a map within one UTM zone, got one that is 11.6 deg",
+        ),
+        (feature("Point", [8.4, 89.0], kind="pole"), "UTM: expected a latitude within 84 deg"),
+        (feature("Point", [*A, 1e300], kind="pole"), r"expected metres within 1e\+07, got 1e\+300"),
         (feature("Point", A), "no feature of 1 is an element: features without the property kind"),
     ],
 )
