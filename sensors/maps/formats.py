@@ -1,11 +1,12 @@
 """The formats that a map can be imported from, by name; each one's module is imported when it is asked for."""
 
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
-from sensors.maps.vector_map import VectorMap
+from sensors.maps.vector_map import Kind, VectorMap
 from sensors.records import LeftOut
 
 FORMATS = {
@@ -30,19 +31,24 @@ _MARKS = {
 
 
 def read_map(
-    path: Path, format: str | None = None, frame: MapFrame | None = None
+    path: Path, format: str | None = None, frame: MapFrame | None = None, rules: Mapping[str, Kind] | None = None
 ) -> tuple[VectorMap, tuple[LeftOut, ...]]:
     """The map of a file, and what of it is left out. format None: as the file looks; frame None: the file's own.
 
-    Raises EgolocError where there is no such file or format, where it cannot be guessed, and as each format does.
+    rules (geojson only): a kind for a GIS's own names, as ``sensors.maps.geojson`` describes. Raises EgolocError where
+    there is no such file or format, where it cannot be guessed, and as each format does.
     """
     path = Path(path)
     if format is not None and format not in FORMATS:
         raise EgolocError(f"format {format}: expected one of {', '.join(FORMATS)}")
     if not path.exists():
         raise EgolocError(f"{path}: no such file or folder")
-    module = import_module(f"sensors.maps.{format or guessed(path)}")
-    found: tuple[VectorMap, tuple[LeftOut, ...]] = module.read(path, frame)
+    format = format or guessed(path)
+    if rules and format != "geojson":
+        raise EgolocError(f"format {format}: rules: only geojson has rules")
+    module = import_module(f"sensors.maps.{format}")
+    found: tuple[VectorMap, tuple[LeftOut, ...]]
+    found = module.read(path, frame, rules) if rules else module.read(path, frame)
     return found
 
 

@@ -50,7 +50,7 @@ def read(path: Path, frame: MapFrame | None = None) -> tuple[VectorMap, tuple[Le
         raise EgolocError(f"{path}: expected ways with a Lanelet2 type (line_thin, road_border, ...), got none")
     builder = Builder(f"{path.name} (Lanelet2)")
     frame, xyz = _coordinates(path, osm, frame, builder)
-    importer = _Importer(osm, xyz, builder)
+    importer = _Importer(path, osm, xyz, builder)
     importer.take_all()
     return builder.built(frame, road_km=importer.road_km()), builder.left_out
 
@@ -64,13 +64,13 @@ def _coordinates(path: Path, osm: Osm, frame: MapFrame | None, builder: Builder)
         row = rows[int(np.argmin(real if real.sum() >= local.sum() else local))]
         name = next(key for key, value in nodes.row.items() if value == row)
         raise EgolocError(f"{path}: node {name}: expected lat and lon, or local_x and local_y, as its neighbours have")
+    refuse_far(str(path), np.column_stack((nodes.local[rows], nodes.height[rows])))
     xyz = np.full((len(nodes.tags), 3), np.nan)
     if real.all() and not (local.all() and not _same_shape(nodes, rows)):
         llh = np.column_stack((np.radians(nodes.lat_lon[rows]), nodes.height[rows]))
         frame, xyz[rows] = placed(str(path), llh, frame)
         return frame, xyz
     refuse_frame(str(path), frame)
-    refuse_far(str(path), np.column_stack((nodes.local[rows], nodes.height[rows])))
     if real.any():
         builder.leave_out("latitudes and longitudes that do not fit local_x and local_y", int(real.sum()))
     xyz[rows] = np.column_stack((nodes.local[rows], nodes.height[rows]))
@@ -97,10 +97,10 @@ def _same_shape(nodes: Nodes, rows: list[int]) -> bool:
 class _Importer:
     """One file's elements on their way into a builder."""
 
-    def __init__(self, osm: Osm, xyz: Floats, builder: Builder) -> None:
-        self.osm, self.xyz, self.builder = osm, xyz, builder
+    def __init__(self, path: Path, osm: Osm, xyz: Floats, builder: Builder) -> None:
+        self.path, self.osm, self.xyz, self.builder = path, osm, xyz, builder
         lanelets = [relation for relation in osm.relations.values() if relation.tags.get("type") == "lanelet"]
-        self.sides_of = {lane.id: _sides(builder.source, lane) for lane in lanelets}
+        self.sides_of = {lane.id: _sides(path, lane) for lane in lanelets}
         self.crosswalks = [lane.id for lane in lanelets if lane.tags.get("subtype") == "crosswalk"]
         self.driving = [lane.id for lane in lanelets if lane.tags.get("subtype", "") in DRIVING]
         self.sides = {ref for lane in self.crosswalks for ref in self.sides_of[lane]}
@@ -179,9 +179,7 @@ class _Importer:
         except ValueError:
             height = -1.0
         if height < 0 or np.isinf(height):
-            raise EgolocError(
-                f"{self.builder.source}: way {way.id}: height: expected metres, got {way.tags['height']!r}"
-            )
+            raise EgolocError(f"{self.path}: way {way.id}: height: expected metres, got {way.tags['height']!r}")
         return height
 
     def _crossings(self) -> None:
@@ -212,10 +210,10 @@ class _Importer:
                 self.builder.leave_out(f"nodes of type {what}: not a known type of a thing that is seen")
 
 
-def _sides(where: str, lane: Relation) -> tuple[str, str]:
+def _sides(path: Path, lane: Relation) -> tuple[str, str]:
     """Ids of the ways left and right of a lanelet."""
     sides = lane.refs("way", "left"), lane.refs("way", "right")
     if [len(side) for side in sides] != [1, 1]:
         got = f"{len(sides[0])} left and {len(sides[1])} right"
-        raise EgolocError(f"{where}: lanelet {lane.id}: expected one way on its left and one on its right, got {got}")
+        raise EgolocError(f"{path}: lanelet {lane.id}: expected one way on its left and one on its right, got {got}")
     return sides[0][0], sides[1][0]

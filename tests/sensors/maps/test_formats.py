@@ -1,11 +1,13 @@
 """The table of formats: guessing, reading by name, and what it refuses."""
 
+import json
 from pathlib import Path
 
 import pytest
 
 from sensors.errors import EgolocError
 from sensors.maps.formats import FORMATS, guessed, read_map
+from sensors.maps.vector_map import Kind
 
 from .osm_text import node, osm, way
 
@@ -35,6 +37,15 @@ def test_a_map_is_read_by_its_look_and_by_name(tmp_path: Path) -> None:
     assert len(read_map(path, "lanelet2")[0].elements) == 1
     with pytest.raises(EgolocError, match="expected JSON"):
         read_map(path, "geojson")
+
+
+def test_rules_are_geojsons(tmp_path: Path) -> None:
+    path = tmp_path / "a.geojson"
+    lamp = {"type": "Feature", "geometry": {"type": "Point", "coordinates": [8.4, 49]}, "properties": {"art": "Mast"}}
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [lamp]}))
+    assert read_map(path, rules={"Mast": Kind.POLE})[0].elements.kind.tolist() == [Kind.POLE]
+    with pytest.raises(EgolocError, match="rules: only geojson has rules"):
+        read_map(osm(tmp_path / "a.osm", node(1, 0, 0)), rules={"Mast": Kind.POLE})
 
 
 def test_what_is_not_known_is_one_line(tmp_path: Path) -> None:

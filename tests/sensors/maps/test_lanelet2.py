@@ -223,7 +223,7 @@ def test_a_damaged_file_is_one_line(tmp_path: Path, elements: list[str], message
     with pytest.raises(EgolocError, match=message) as caught:
         read(path)
     assert "\n" not in str(caught.value)
-    assert "a.osm" in str(caught.value)
+    assert str(caught.value).startswith(str(path))
 
 
 @pytest.mark.parametrize(
