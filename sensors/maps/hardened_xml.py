@@ -4,12 +4,11 @@ Map formats need no document type declaration, and every known XML bomb does (en
 so one is refused before it is read. The parser is the standard library's expat.
 """
 
+import math
 from pathlib import Path
 from typing import NoReturn
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
-
-import numpy as np
 
 from sensors.errors import EgolocError
 
@@ -17,6 +16,10 @@ MAX_BYTES = 1 << 28
 """A map of some hundred kilometres of road; elements in memory take about ten times as much."""
 MAX_DEPTH = 64
 """Elements inside each other; OpenDRIVE and OSM use ten."""
+
+
+LARGEST = 1e12
+"""Numbers beyond this are no lengths, angles or coefficients, and overflow when squared often enough."""
 
 
 class Node(Element):
@@ -96,7 +99,7 @@ def mistake(element: Element, what: str) -> EgolocError:
 
 
 def number(element: Element, key: str, default: float | None = None) -> float:
-    """A finite number of an attribute; default where the attribute is absent, None: it is required."""
+    """A finite number of an attribute, LARGEST at most; default where the attribute is absent, None: it is required."""
     text = element.get(key)
     if text is None:
         if default is None:
@@ -105,7 +108,7 @@ def number(element: Element, key: str, default: float | None = None) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
+        value = math.nan
+    if not abs(value) <= LARGEST:
         raise mistake(element, f"{key}: expected a finite number, got {text[:40]!r}")
     return value
