@@ -10,9 +10,10 @@ fits. Outvoted again soon, the state is given up (``fusion.divergence``).
 import math
 
 from fusion._linalg import Vector, attitude, matvec
+from fusion.blocks import renew
 from fusion.events import Parameters
-from fusion.giving_way import doubt_all, forget, give_way, give_way_turning, give_way_upwards
-from fusion.health import gave_way
+from fusion.giving_way import doubt_all, forget, give_way, give_way_nearby, give_way_turning, give_way_upwards
+from fusion.health import gave_way, strained
 from fusion.measurements import Pair, wrap
 from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_SINCE, D_STREAK, D_TIME, H_OUTVOTED, Core
 from sensors.kernel import kernel
@@ -140,6 +141,28 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
             core.health[H_OUTVOTED] = now
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
         clock[1, D_STREAK] = 0
+
+
+@kernel()
+def pulled_off(core: Core, par: Parameters, now: int) -> bool:
+    """Whether GNSS slid aside, pulled the state along, and left it: it has been rejected since, and what lasts of an
+    error had to be more than it can be. Then the state is worth less than pose fixes nearby."""
+    if not in_doubt(core, 0, now):
+        return False
+    lasts: bool = now - core.doubt_clock[0, D_SINCE] >= par.health.contradicted_ns
+    return lasts and strained(core, par.health)
+
+
+@kernel()
+def hold_on(core: Core, par: Parameters, place_var: float, yaw_var: float, now: int) -> None:
+    """Let P give way to a pose fix so far off, m^2, rad^2, and forget what lasts of either sensor's error."""
+    give_way_nearby(core.P, place_var, yaw_var)
+    for first in (par.layout.gnss_error, par.layout.pose_error):
+        if first >= 0:
+            renew(core, first)
+    core.slipped[:] = 0.0
+    gave_way(core.health, par.health.settled_ns, True, now)
+    core.doubt_clock[1, D_COUNT] = core.doubt_clock[1, D_STREAK] = core.doubt_clock[0, D_AGREED] = 0
 
 
 @kernel()
