@@ -146,14 +146,16 @@ def _apply_renewed(
 def _hold_on(
     core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Events, e: int, rate: Vector, k: int
 ) -> bool:
-    """A pose fix beside a state that was pulled off: it is applied with nothing known of errors that last, unless it is
-    so far off that it may be an alias. Seldom, so it is compiled for itself. Whether it passed."""
+    """A pose fix beside a state that was pulled off: it is applied with nothing known of errors that last, unless it
+    fits the state without any, or is so far off that it may be an alias. Seldom, so it is compiled for itself. Whether
+    it passed."""
     kind, residual = ev.kind[e], core.residual
-    measure(core, par, m, kind, ev.row[e], rate, np.bool_(False))
-    place_var = residual[0] * residual[0] + residual[1] * residual[1]
-    if place_var > ALIAS_M * ALIAS_M:
+    dof, accepted = measure(core, par, m, kind, ev.row[e], rate, np.bool_(False))
+    place_var, yaw_var = residual[0] * residual[0] + residual[1] * residual[1], residual[2] * residual[2]
+    known = innovate(core.P, core.H, core.W, dof, core.R, core.L)
+    if place_var > ALIAS_M * ALIAS_M or (known and whiten(dof, residual, core.L) <= par.gate[dof - 1]):
         return False
-    hold_on(core, par, place_var, residual[2] * residual[2], ev.t[e])
+    hold_on(core, par, place_var, yaw_var, ev.t[e])
     dof, accepted = measure(core, par, m, kind, ev.row[e], rate, _LASTS)
     passed: bool = _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
     return passed
