@@ -49,7 +49,7 @@ def believed(core: Core, par: Parameters, which: int, z: Vector, now: int) -> No
 def _goes_on(core: Core, par: Parameters, z: Vector, now: int) -> bool:
     """Whether GNSS alone, accepted now, says what it said while it was rejected: then it is the state that gave way."""
     clock, said = core.doubt_clock, core.doubt[0]
-    if clock[0, D_COUNT] == 0 or not _for_long(core, par, now):
+    if clock[0, D_COUNT] == 0 or not (_for_long(core, par, now) and _alone(core, now)):
         return False
     near: bool = math.hypot(z[0] - said[0], z[1] - said[1]) < 0.5 * math.hypot(said[0], said[1])
     return near
@@ -57,9 +57,9 @@ def _goes_on(core: Core, par: Parameters, z: Vector, now: int) -> bool:
 
 @kernel()
 def _for_long(core: Core, par: Parameters, now: int) -> bool:
-    """Whether GNSS, alone, has contradicted the state for longer than two sensors need."""
+    """Whether GNSS has contradicted the state for longer than two sensors need."""
     lasts: bool = now - core.doubt_clock[0, D_SINCE] >= par.health.contradicted_ns
-    return lasts and _alone(core, now)
+    return lasts
 
 
 @kernel()
@@ -114,7 +114,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
         elif clock[which, D_COUNT] >= par.outvoted:
             if which == 0:
                 give_way_upwards(core.P, z[2], climb)
-                if _for_long(core, par, now):  # all but the height has given way by now
+                if _for_long(core, par, now) and _alone(core, now):  # all but the height has given way by now
                     gave_way(core.health, par.health.settled_ns, True, now)
             else:
                 give_way_turning(core.P, z[2])
@@ -147,10 +147,8 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
 def pulled_off(core: Core, par: Parameters, now: int) -> bool:
     """Whether GNSS slid aside, pulled the state along, and left it: it has been rejected since, and what lasts of an
     error had to be more than it can be. Then the state is worth less than pose fixes nearby."""
-    if not in_doubt(core, 0, now):
-        return False
-    lasts: bool = now - core.doubt_clock[0, D_SINCE] >= par.health.contradicted_ns
-    return lasts and strained(core, par.health)
+    pulled: bool = in_doubt(core, 0, now) and _for_long(core, par, now) and strained(core, par.health)
+    return pulled
 
 
 @kernel()
