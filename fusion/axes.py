@@ -10,11 +10,9 @@ import numpy as np
 
 from fusion._linalg import Vector, attitude
 from fusion.state import E_ACCEL_BIAS, E_ATTITUDE, QUATERNION, Floats
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.kernel import kernel
 from sensors.rotation import matrix_from_q
-
-GRAVITY = 9.80665
-"""m/s^2."""
 
 
 @kernel(inline="always")
@@ -27,13 +25,13 @@ def add_lean(nav: Floats, variance: float, sigma: Floats, pose_cov: Floats) -> N
             pose_cov[3 + i, 3 + j] += variance * ((1.0 if i == j else 0.0) - up[i] * up[j])
         sigma[6 + i] = np.sqrt(pose_cov[3 + i, 3 + i])
     for i in range(12, 14):
-        sigma[i] = np.sqrt(sigma[i] * sigma[i] + variance * GRAVITY * GRAVITY)
+        sigma[i] = np.sqrt(sigma[i] * sigma[i] + variance * STANDARD_GRAVITY * STANDARD_GRAVITY)
 
 
 def with_lean(P: Floats, nav: Floats, variance: float) -> Floats:
     """P (n, n) with the lean added. variance: rad^2, each way."""
     lean = np.zeros((len(P), 2))
     lean[E_ATTITUDE] = matrix_from_q(nav[QUATERNION])[:, :2]
-    lean[E_ACCEL_BIAS] = ((0.0, GRAVITY), (-GRAVITY, 0.0), (0.0, 0.0))
+    lean[E_ACCEL_BIAS] = ((0.0, STANDARD_GRAVITY), (-STANDARD_GRAVITY, 0.0), (0.0, 0.0))
     result: Floats = P + variance * lean @ lean.T
     return result

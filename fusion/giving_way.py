@@ -72,6 +72,17 @@ def give_way(P: Floats, doubt: Floats) -> None:
 
 
 @kernel()
+def give_way_nearby(P: Floats, place_var: float, yaw_var: float) -> None:
+    """Widen place and yaw by so much, m^2, rad^2, the velocity, which went along, and what was taken in by it."""
+    for i in range(2):
+        P[i, i] += place_var
+    for i in range(3):
+        P[3 + i, 3 + i] += VELOCITY_VAR
+    doubt_all(P)
+    P[8, 8] += yaw_var
+
+
+@kernel()
 def give_way_turning(P: Floats, turn: float) -> None:
     """Widen the yaw by how far it is off, rad, the gyro's bias, which may have turned it while votes were counted, the
     tilt, which went through the same turn, and the scale of the wheel, which was learned across the vehicle's axis."""

@@ -159,14 +159,14 @@ def _weakness(core: Core, limits: HealthLimits, now: int) -> int:
     for sensor in range(_COUNT):
         if _ABSENT < level_of(core.trust, limits.stale_ns[sensor], limits.suspect, sensor, now) < _GOOD:
             return sensor + 1
-    if _strained(core, limits):
+    if strained(core, limits):
         return _LASTING_ERROR
     P = core.P
     return _SIGMA if P[0, 0] + P[1, 1] > limits.sigma_var or P[8, 8] > limits.sigma_yaw_var else _NONE
 
 
 @kernel()
-def _strained(core: Core, limits: HealthLimits) -> bool:
+def strained(core: Core, limits: HealthLimits) -> bool:
     """Whether what lasts of a horizontal position's error, or of a pose fix's yaw, has grown beyond what it can be.
 
     Its states have unit variance (``fusion.blocks``). They take in what a sensor says against the rest as long as it

@@ -10,9 +10,10 @@ fits. Outvoted again soon, the state is given up (``fusion.divergence``).
 import math
 
 from fusion._linalg import Vector, attitude, matvec
+from fusion.blocks import renew
 from fusion.events import Parameters
-from fusion.giving_way import doubt_all, forget, give_way, give_way_turning, give_way_upwards
-from fusion.health import gave_way
+from fusion.giving_way import doubt_all, forget, give_way, give_way_nearby, give_way_turning, give_way_upwards
+from fusion.health import gave_way, strained
 from fusion.measurements import Pair, wrap
 from fusion.state import D_AGREED, D_BELIEVED, D_COUNT, D_SINCE, D_STREAK, D_TIME, H_OUTVOTED, Core
 from sensors.kernel import kernel
@@ -48,7 +49,7 @@ def believed(core: Core, par: Parameters, which: int, z: Vector, now: int) -> No
 def _goes_on(core: Core, par: Parameters, z: Vector, now: int) -> bool:
     """Whether GNSS alone, accepted now, says what it said while it was rejected: then it is the state that gave way."""
     clock, said = core.doubt_clock, core.doubt[0]
-    if clock[0, D_COUNT] == 0 or not _for_long(core, par, now):
+    if clock[0, D_COUNT] == 0 or not (_for_long(core, par, now) and _alone(core, now)):
         return False
     near: bool = math.hypot(z[0] - said[0], z[1] - said[1]) < 0.5 * math.hypot(said[0], said[1])
     return near
@@ -56,9 +57,9 @@ def _goes_on(core: Core, par: Parameters, z: Vector, now: int) -> bool:
 
 @kernel()
 def _for_long(core: Core, par: Parameters, now: int) -> bool:
-    """Whether GNSS, alone, has contradicted the state for longer than two sensors need."""
+    """Whether GNSS has contradicted the state for longer than two sensors need."""
     lasts: bool = now - core.doubt_clock[0, D_SINCE] >= par.health.contradicted_ns
-    return lasts and _alone(core, now)
+    return lasts
 
 
 @kernel()
@@ -113,7 +114,7 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
         elif clock[which, D_COUNT] >= par.outvoted:
             if which == 0:
                 give_way_upwards(core.P, z[2], climb)
-                if _for_long(core, par, now):  # all but the height has given way by now
+                if _for_long(core, par, now) and _alone(core, now):  # all but the height has given way by now
                     gave_way(core.health, par.health.settled_ns, True, now)
             else:
                 give_way_turning(core.P, z[2])
@@ -140,6 +141,26 @@ def doubted(core: Core, par: Parameters, which: int, z: Vector, ahead: Pair, now
             core.health[H_OUTVOTED] = now
         clock[0, D_COUNT] = clock[1, D_COUNT] = clock[0, D_AGREED] = 0
         clock[1, D_STREAK] = 0
+
+
+@kernel()
+def pulled_off(core: Core, par: Parameters, now: int) -> bool:
+    """Whether GNSS slid aside, pulled the state along, and left it: it has been rejected since, and what lasts of an
+    error had to be more than it can be. Then the state is worth less than pose fixes nearby."""
+    pulled: bool = in_doubt(core, 0, now) and _for_long(core, par, now) and strained(core, par.health)
+    return pulled
+
+
+@kernel()
+def hold_on(core: Core, par: Parameters, place_var: float, yaw_var: float, now: int) -> None:
+    """Let P give way to a pose fix so far off, m^2, rad^2, and forget what lasts of either sensor's error."""
+    give_way_nearby(core.P, place_var, yaw_var)
+    for first in (par.layout.gnss_error, par.layout.pose_error):
+        if first >= 0:
+            renew(core, first)
+    core.slipped[:] = 0.0
+    gave_way(core.health, par.health.settled_ns, True, now)
+    core.doubt_clock[1, D_COUNT] = core.doubt_clock[1, D_STREAK] = core.doubt_clock[0, D_AGREED] = 0
 
 
 @kernel()

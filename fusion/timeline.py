@@ -17,9 +17,8 @@ from fusion.events import MOTION, OUTPUT, Events, Parameters
 from fusion.layout import OFF, Layout, layout_of
 from fusion.sensor_models import ImuNoise
 from fusion.sources import APPLY, Sources
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.vehicle import ImuSpec, Vehicle
-
-STANDARD_GRAVITY = 9.80665
 
 _ROOT_HOUR = 60.0
 _DEG_PER_H = math.pi / 180.0 / 3600.0

@@ -14,11 +14,11 @@ from fusion.health import SOURCES, hopeless, judge, level_of, noted, questionabl
 from fusion.measurements import Pair, heading
 from fusion.motion import motion
 from fusion.observing import measure, triple
-from fusion.recovery import believed, doubted, in_doubt
+from fusion.recovery import believed, doubted, hold_on, in_doubt, pulled_off
 from fusion.result import Reason, Sensor
 from fusion.robust import reweigh
 from fusion.state import A_T, H_CAUSE, H_STATE, ROW, Core
-from fusion.streak import may_renew, tally, threshold_of
+from fusion.streak import ALIAS_M, may_renew, tally, threshold_of
 from fusion.tape import note_correction, note_move, note_state
 from sensors.kernel import kernel
 
@@ -88,6 +88,8 @@ def handle(core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Even
             tally(core, par, int(kind == _POSE_FIX), passed, ev.t[e])
         if dof == 3:
             _weigh(core, rec, par, int(kind == _POSE_FIX), passed, k, ev.t[e])
+            if kind == _POSE_FIX and pulled_off(core, par, ev.t[e]):
+                passed = _hold_on(core, rec, par, m, ev, e, rate, k) or passed
     if kind < _SOURCES:
         explained = passed and rec.scores[k, 0] <= par.health.explained[dof - 1]
         noted(core.health, core.trust, par.health.suspect, kind, passed, explained, ev.t[e])
@@ -138,6 +140,25 @@ def _apply_renewed(
             break
         renew(core, first)
     return passed, dof, accepted
+
+
+@kernel()
+def _hold_on(
+    core: Core, rec: Recorder, par: Parameters, m: Measurements, ev: Events, e: int, rate: Vector, k: int
+) -> bool:
+    """A pose fix beside a state that was pulled off: it is applied with nothing known of errors that last, unless it
+    fits the state without any, or is so far off that it may be an alias. Seldom, so it is compiled for itself. Whether
+    it passed."""
+    kind, residual = ev.kind[e], core.residual
+    dof, accepted = measure(core, par, m, kind, ev.row[e], rate, np.bool_(False))
+    place_var, yaw_var = residual[0] * residual[0] + residual[1] * residual[1], residual[2] * residual[2]
+    known = innovate(core.P, core.H, core.W, dof, core.R, core.L)
+    if place_var > ALIAS_M * ALIAS_M or (known and whiten(dof, residual, core.L) <= par.gate[dof - 1]):
+        return False
+    hold_on(core, par, place_var, yaw_var, ev.t[e])
+    dof, accepted = measure(core, par, m, kind, ev.row[e], rate, _LASTS)
+    passed: bool = _apply(core, rec, par, k, dof, par.gate[dof - 1], accepted)
+    return passed
 
 
 @kernel()

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from fusion.result import Cause, Decisions, FusionResult, Reason, Sensor
 from replay.decisions import APPLIED, FIXES
 from replay.health import Tally
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.clock import NS_PER_S
 from sensors.records import Imu, Log
 
 Floats = NDArray[np.float64]
 Findings = list[dict[str, str]]
 
-STANDARD_GRAVITY = 9.80665
 SAMPLES = 40_000
 """IMU samples, evenly spread, that are looked at (down to half as many)."""
 FORCE_TOLERANCE = 1.0

@@ -12,6 +12,8 @@ WGS84_E2 = WGS84_F * (2.0 - WGS84_F)
 """First eccentricity squared."""
 EARTH_RATE = 7.292115e-5
 """Earth's rotation, rad/s (WGS-84)."""
+STANDARD_GRAVITY = 9.80665
+"""What a g of a datasheet is, m/s^2."""
 GRAVITY_EQUATOR = 9.7803253359
 """Normal gravity at the equator, m/s^2."""
 _SOMIGLIANA = 0.001931852652458

@@ -70,7 +70,7 @@ def _push_all(log: Log, most: int | None = None) -> tuple[NDArray[np.float64], N
     localizer = Localizer(log.vehicle, log.map_frame, FusionConfig(order="arrival"))
     calls = in_arrival_order(log)[:most]
     records = [getattr(log, name) for name in SENSORS]
-    spent = np.zeros((2, len(calls)))
+    spent = np.full((2, len(calls)), np.nan)  # its pages are there from now on, and no growth later
     before = 0.0
     gc.collect()
     for i, (sensor, k) in enumerate(calls):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.clock import seconds
 from sensors.records import Imu
 from sensors.rotation import matrix_from_q, multiply
@@ -21,8 +22,6 @@ from sensors.rotation import matrix_from_q, multiply
 Floats = NDArray[np.float64]
 Kind = Literal["position", "velocity"]
 
-GRAVITY = 9.80665
-"""Good to 0.3 %: the accelerometer bias of the fit takes the rest, m/s^2."""
 ACCEL_BIAS_PRIOR = 0.3
 """Standard deviation of a consumer accelerometer's bias, m/s^2."""
 GYRO_BIAS_PRIOR = 0.003
@@ -121,7 +120,8 @@ def fit_window(
     drop = np.stack((np.ones_like(elapsed), elapsed) if kind == "position" else (np.ones_like(elapsed),), axis=1)
     Q, _ = np.linalg.qr(drop)
     gravity = np.zeros((len(t), 3))
-    gravity[:, 2] = GRAVITY * (elapsed**2 / 2 if kind == "position" else elapsed)
+    # good to 0.3 %: the accelerometer bias of the fit takes the rest
+    gravity[:, 2] = STANDARD_GRAVITY * (elapsed**2 / 2 if kind == "position" else elapsed)
     y = _detrend(Q, values[rows] + gravity)
     f = _detrend(Q, at[:, _OFFSETS["f" + order]])
     c = _detrend(Q, at[:, _OFFSETS["c" + order]]).reshape(-1, 3, 3)
@@ -201,7 +201,7 @@ def _velocity(
         f, c, k = (at[:, _OFFSETS[name + order]] for name in "fck")
         k = k.reshape(-1, 3, 3) - _skew(f) @ J0
         integral[order] = (f - c.reshape(-1, 3, 3) @ bias[:3] + k @ bias[3:]) @ R.T
-    up = np.array([0.0, 0.0, GRAVITY])
+    up = np.array([0.0, 0.0, STANDARD_GRAVITY])
     rate: Floats = integral["1"] - elapsed[:, None] * up
     if kind == "velocity":
         start: Floats = np.mean(values - rate, axis=0)

@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.clock import GPS_EPOCH_NS, NS_PER_S, utc_from_gps
 from sensors.errors import EgolocError
 from sensors.records import Imu, LeftOut
 from sensors.screening import screen
 
 Floats = NDArray[np.float64]
-
-STANDARD_GRAVITY = 9.80665
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.bounds import NonNegative, Positive
 from sensors.clock import seconds
 from sensors.records import Imu
@@ -19,8 +20,6 @@ from sensors.vehicle import ImuSpec
 
 Floats = NDArray[np.float64]
 
-STANDARD_GRAVITY = 9.80665
-"""What datasheets call g, m/s^2."""
 DEG_PER_H = np.pi / 180 / 3600
 MILLI_G = STANDARD_GRAVITY / 1000
 NODE_S = 1.0

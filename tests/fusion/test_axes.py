@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusion.axes import GRAVITY, add_lean, with_lean
+from fusion.axes import add_lean, with_lean
 from fusion.config import Estimate, FusionConfig
 from fusion.filter import Localizer
 from fusion.layout import OFF
@@ -14,6 +14,7 @@ from fusion.run import run
 from fusion.smoother import smooth
 from fusion.timeline import parameters
 from replay.bench.consistency import AS_DRAWN, nees
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.simulate.drive import simulate_drive
 from sensors.simulate.imu_presets import ImuFlaws
 from sensors.simulate.scenarios import load
@@ -38,7 +39,7 @@ def test_both_ways_of_stating_it_agree() -> None:
     whole = with_lean(P, nav, variance)
     assert sigma == pytest.approx(np.sqrt(np.diag(whole)), rel=1e-12)
     np.testing.assert_allclose(pose_cov, whole[np.ix_(pose, pose)], rtol=1e-12, atol=1e-12)
-    assert np.diag(whole - P)[12:15] == pytest.approx(variance * GRAVITY**2 * np.array([1.0, 1.0, 0.0]))
+    assert np.diag(whole - P)[12:15] == pytest.approx(variance * STANDARD_GRAVITY**2 * np.array([1.0, 1.0, 0.0]))
 
 
 def test_a_lean_makes_no_force_with_its_bias() -> None:
@@ -48,7 +49,7 @@ def test_a_lean_makes_no_force_with_its_bias() -> None:
     of_lean = with_lean(np.zeros((15, 15)), nav, 1.0)
     c, s = np.cos(0.8), np.sin(0.8)
     force = np.zeros((3, 15))
-    force[:, 6:9] = -np.array([[0.0, -GRAVITY, 0.0], [GRAVITY, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    force[:, 6:9] = -np.array([[0.0, -STANDARD_GRAVITY, 0.0], [STANDARD_GRAVITY, 0.0, 0.0], [0.0, 0.0, 0.0]])
     force[:, 12:15] = -np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     assert np.abs(force @ of_lean @ force.T).max() < 1e-12
     assert of_lean[6, 6] == pytest.approx(1.0)
@@ -100,7 +101,7 @@ def test_every_output_states_it() -> None:
         assert np.array_equal(untold.q_enu_body, stated.q_enu_body)
         grown = stated.sigma**2 - untold.sigma**2
         assert grown[:, 6:8].mean() == pytest.approx(variance, rel=0.01)
-        assert grown[:, 12:14] == pytest.approx(np.full((len(grown), 2), variance * GRAVITY**2), rel=1e-6)
+        assert grown[:, 12:14] == pytest.approx(np.full((len(grown), 2), variance * STANDARD_GRAVITY**2), rel=1e-6)
         assert np.abs(grown[:, :6]).max() == 0.0
     live = [Localizer(each.vehicle, each.map_frame) for each in (log, told)]
     for localizer in live:
@@ -110,4 +111,4 @@ def test_every_output_states_it() -> None:
     before, after = (localizer.covariance() for localizer in live)
     assert before is not None
     assert after is not None
-    assert np.diag(after - before)[12] == pytest.approx(variance * GRAVITY**2, rel=1e-6)
+    assert np.diag(after - before)[12] == pytest.approx(variance * STANDARD_GRAVITY**2, rel=1e-6)

@@ -150,6 +150,25 @@ def test_wrong_sensors_that_disagree_outvote_nothing(drive: Drive) -> None:
     assert (np.abs(errors) < LIMITS).all()
 
 
+@pytest.mark.parametrize(("seed", "rate", "slides_s"), [(100_007, 0.05, 12.0), (100_021, 0.08, 8.0)])
+def test_a_state_that_gnss_pulled_off_and_left_holds_on_to_pose_fixes(seed: int, rate: float, slides_s: float) -> None:
+    """GNSS slides aside and takes the state along, pose fixes explained by an error that lasts; then it jumps far off.
+    Nothing agrees: the state stayed where it was left, for as long as that went on."""
+    drive = simulate_drive(150.0, seed, scenarios.load("clean"))
+    gnss = drive.log.gnss
+    assert gnss is not None
+    s = seconds(drive.log, gnss.t_ns)
+    for step in np.arange(0.0, slides_s, 0.1):
+        inside = (s >= 60.0 + step) & (s < 60.1 + step)
+        gnss = off(gnss, inside, np.array([0.0, rate * step, 0.0]), GnssStatus.FIXED, 0.014)
+    gone = (s >= 60.0 + slides_s) & (s < 100.0)
+    gnss = off(gnss, gone, np.array([3.0, -2.5, 0.0]), GnssStatus.FIXED, 0.014)
+    t, errors = late(drive, FusionConfig(), replace(drive.log, gnss=gnss), 60.0)
+    far = np.hypot(errors[:, 0], errors[:, 1])
+    assert far[t < 60.0 + slides_s].max() > 0.3  # it was pulled off
+    assert far[t > 62.0 + slides_s].max() < 0.12
+
+
 @pytest.mark.parametrize("frames", [1, 4])
 def test_a_first_fix_that_gnss_contradicts_is_not_believed(drive: Drive, frames: int) -> None:
     log = drive.log

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.simulate.drive import Drive, DriveConfig, city_truth
-from sensors.simulate.imu import STANDARD_GRAVITY, simulate_imu
+from sensors.simulate.imu import simulate_imu
 from sensors.simulate.noise import stamps
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import ImuSpec

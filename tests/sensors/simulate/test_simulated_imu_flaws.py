@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sensors._kernels import STANDARD_GRAVITY
 from sensors.errors import EgolocError
 from sensors.simulate.drive import DriveConfig, simulate_drive
-from sensors.simulate.imu import STANDARD_GRAVITY, ImuSensor, ImuSimulation, Temperature, Vibration
+from sensors.simulate.imu import ImuSensor, ImuSimulation, Temperature, Vibration
 from sensors.simulate.imu_presets import PRESETS, ImuFlaws, PresetName
 from sensors.simulate.trajectory import Truth
 from sensors.vehicle import ImuSpec, Vehicle
