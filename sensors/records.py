@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sensors.errors import EgolocError
+from sensors.frames import Frame as Frame
+from sensors.frames import Sweep as Sweep
 from sensors.geodesy import MapFrame
 from sensors.vehicle import Vehicle
 
