@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sensors.errors import EgolocError
-from sensors.frames import Frame as Frame
-from sensors.frames import Sweep as Sweep
+from sensors.frames import Frame as Frame  # noqa: PLC0414 (part of the records, in a file of their own)
+from sensors.frames import Sweep as Sweep  # noqa: PLC0414
 from sensors.geodesy import MapFrame
 from sensors.vehicle import Vehicle
 
