@@ -16,7 +16,6 @@ from sensors.maps.vector_map import Floats
 VERTICAL = ("+geoidgrids", "+vunits", "+vto_meter")
 
 
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Georeference:
     """A projection. zone: that of the file if it is a UTM one, negative in the south, 0 where it is another."""

@@ -65,8 +65,8 @@ def refuse_far(where: str, metres: Floats) -> None:
 
 
 def refuse_frame(where: str, frame: MapFrame | None) -> None:
-    """Refuse to bring local coordinates into a frame on the earth."""
-    if frame is not None:
+    """Refuse to bring local coordinates into a frame on the earth; files of one plane may be brought together."""
+    if frame not in (None, LOCAL):
         raise EgolocError(
             f"{where}: has only local coordinates, without georeference: cannot be brought into a map frame"
         )
