@@ -14,6 +14,7 @@ from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
+from replay.commands.map_check import CheckMap
 from replay.commands.map_files import ExportMap, ImportMap
 from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
@@ -31,7 +32,7 @@ COMMANDS = {
     "allan": Allan,
     "noise": Noise,
 }
-MAPS = {"import": ImportMap, "export": ExportMap}
+MAPS = {"import": ImportMap, "export": ExportMap, "check": CheckMap}
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."
 MAP_DESCRIPTION = "Vector maps: make them, look into them, judge them."
 BENCH_DESCRIPTION = "Measure speed beside other libraries, and how well the filter does where it is hard."

@@ -14,6 +14,7 @@ from sensors.maps.formats import read_map
 from sensors.maps.geojson_out import write_geojson
 from sensors.maps.map_file import open_map
 from sensors.maps.quantized import cm_from_m
+from sensors.maps.store import write_map
 from sensors.maps.vector_map import Elements, Kind, Style
 from sensors.mcap.io import write_log
 from sensors.records import Log
@@ -200,3 +201,20 @@ def test_maps_of_different_planes_do_not_become_one(tmp_path: Path, capsys: pyte
     capsys.readouterr()
     error = refusal(capsys, "map", "import", "auto", other, one, tmp_path / "map.parquet")
     assert "a.geojson: the map asked for is another place's" in error
+
+
+def test_check_lists_errors_and_says_so_by_its_exit_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, sound = street(tmp_path / "a.geojson"), tmp_path / "sound.parquet"
+    builder = Builder("street")
+    for name in ("one", "two"):
+        builder.add(Kind.LANE_LINE, [[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]], name=name)
+    write_map(builder.built(FRAME), tmp_path / "twice.parquet")
+    assert main(["map", "import", "geojson", str(source), str(sound)]) == 0
+    assert main(["map", "check", str(sound)]) == 0
+    assert "0 errors, 0 notices in 2 elements" in capsys.readouterr().out
+    assert main(["map", "check", str(tmp_path / "twice.parquet")]) == 1
+    assert "one (lane_line) and two (lane_line) at 0.00, 0.00" in capsys.readouterr().out
+    assert main(["map", "check", str(tmp_path / "twice.parquet"), "--json"]) == 1
+    (finding,) = json.loads(capsys.readouterr().out)["findings"]
+    assert (finding["check"], finding["error"]) == ("duplicate", True)
+    assert "none.parquet" in refusal(capsys, "map", "check", tmp_path / "none.parquet")
