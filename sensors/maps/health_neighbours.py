@@ -1,7 +1,7 @@
 """Checks of elements beside each other."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -139,39 +139,51 @@ def _off_road_surfels(elements: Elements, surfels: Surfels, shapes: NDArray[Any]
         yield Finding(Check.OFF_ROAD, (), x, y, f"{(~near).sum()} surfels, none within {SURFEL_REACH_M:g} m of them")
 
 
+class _Ends(NamedTuple):
+    """E ends of lines. of: (E,) rows; at: (E, 3) m; inwards: (E, 3) from the end to the vertex before it."""
+
+    of: Rows
+    at: Floats
+    inwards: Floats
+
+
 def _ends(elements: Elements, seen: NDArray[np.bool_]) -> Iterator[Finding]:
-    """Gaps and steps between lines of a kind and style that go on in each other."""
+    """Gaps and steps between lines of a kind that end near each other; gaps only where one goes on in the other."""
     rows = np.flatnonzero(np.isin(elements.kind, _LINES) & seen & (np.diff(elements.first) > 1))
-    if not len(rows):
-        return
     begin, end = elements.first[:-1][rows], elements.first[1:][rows] - 1
     at = elements.xyz[np.concatenate((begin, end))]
-    inwards = elements.xyz[np.concatenate((begin + 1, end - 1))] - at
-    of = np.concatenate((rows, rows))
-    one, other = shapely.STRtree(shapely.points(at[:, :2])).query(
-        shapely.points(at[:, :2]), predicate="dwithin", distance=GAP_M
-    )
-    alike = (one != other) & (of[one] != of[other]) & (elements.kind[of[one]] == elements.kind[of[other]])
-    one, other = one[alike], other[alike]
+    ends = _Ends(np.concatenate((rows, rows)), at, elements.xyz[np.concatenate((begin + 1, end - 1))] - at)
+    one, other = _near_ends(elements, ends)
     apart = np.hypot(*(at[one] - at[other])[:, :2].T)
     joined = np.bincount(one[apart <= JOINT_M], minlength=len(at)) > 0
+    once = ends.of[one] < ends.of[other]
+    gaps = once & (apart > JOINT_M) & ~joined[one] & ~joined[other] & _onwards(elements, ends, one, other)
+    yield from _pairs(ends, Check.GAP, one[gaps], other[gaps], [f"{each:.2f} m" for each in apart[gaps]])
     rise = at[other, 2] - at[one, 2]
-    onwards = _onwards(inwards[one, :2], inwards[other, :2]) & (elements.style[of[one]] == elements.style[of[other]])
-    once = of[one] < of[other]
-    for k in np.flatnonzero(once & onwards & (apart > JOINT_M) & ~joined[one] & ~joined[other]):
-        pair = int(of[one[k]]), int(of[other[k]])
-        x, y = at[one[k], :2].tolist()
-        yield Finding(Check.GAP, pair, x, y, f"{apart[k]:.2f} m")
     with np.errstate(invalid="ignore"):
         steps = once & (apart <= JOINT_M) & (np.abs(rise) > STEP_M) & (np.abs(rise) < STOREY_M)
-    for k in np.flatnonzero(steps):
-        pair = int(of[one[k]]), int(of[other[k]])
-        x, y = at[one[k], :2].tolist()
-        yield Finding(Check.HEIGHT_STEP, pair, x, y, f"{rise[k]:+.2f} m")
+    yield from _pairs(ends, Check.HEIGHT_STEP, one[steps], other[steps], [f"{each:+.2f} m" for each in rise[steps]])
 
 
-def _onwards(one: Floats, other: Floats) -> NDArray[np.bool_]:
-    """Whether lines that end with these legs, seen from their ends, go on in each other."""
-    cosine = (one * other).sum(axis=1) / np.maximum(np.hypot(*one.T) * np.hypot(*other.T), 1e-9)
-    result: NDArray[np.bool_] = cosine < -np.cos(np.radians(ALONG_DEG))
+def _near_ends(elements: Elements, ends: _Ends) -> tuple[Rows, Rows]:
+    """Pairs of ends of two lines of a kind within GAP_M of each other, each in both orders."""
+    points = shapely.points(ends.at[:, :2])
+    one, other = shapely.STRtree(points).query(points, predicate="dwithin", distance=GAP_M)
+    kind = elements.kind[ends.of]
+    alike = (ends.of[one] != ends.of[other]) & (kind[one] == kind[other])
+    return one[alike], other[alike]
+
+
+def _pairs(ends: _Ends, check: Check, one: Rows, other: Rows, details: list[str]) -> Iterator[Finding]:
+    for a, b, detail in zip(one, other, details, strict=True):
+        x, y = ends.at[a, :2].tolist()
+        yield Finding(check, (int(ends.of[a]), int(ends.of[b])), x, y, detail)
+
+
+def _onwards(elements: Elements, ends: _Ends, one: Rows, other: Rows) -> NDArray[np.bool_]:
+    """(P,) whether lines of a style, seen from these ends, go on in each other."""
+    a, b = ends.inwards[one, :2], ends.inwards[other, :2]
+    cosine = (a * b).sum(axis=1) / np.maximum(np.hypot(*a.T) * np.hypot(*b.T), 1e-9)
+    style = elements.style[ends.of]
+    result: NDArray[np.bool_] = (cosine < -np.cos(np.radians(ALONG_DEG))) & (style[one] == style[other])
     return result
