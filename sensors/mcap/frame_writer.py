@@ -51,7 +51,9 @@ class FrameWriter:
             self._write(self._next)
             following = next(self._frames, None)
             if following is not None and following.t_ns <= self._next.t_ns:
-                raise EgolocError(f"frames: t_ns: expected increasing stamps, got {following.t_ns} after {self._next.t_ns}")
+                raise EgolocError(
+                    f"frames: t_ns: expected increasing stamps, got {following.t_ns} after {self._next.t_ns}"
+                )
             self._next = following
 
     def _write(self, frame: Frame) -> None:

@@ -177,7 +177,9 @@ class FrameReader:
                 self._static = static_transforms(self.path)
             T = pose_of(self._static, frame)
             if T is None:
-                log.warning("%s: %s: no /tf_static leads from base_link to %r: taken as base_link", self.path, topic, frame)
+                log.warning(
+                    "%s: %s: no /tf_static leads from base_link to %r: taken as base_link", self.path, topic, frame
+                )
                 T = np.eye(4)
             self._poses[frame] = T
         return self._poses[frame]
