@@ -5,8 +5,8 @@ poses in city coordinates become the reference, in the city's UTM frame (``senso
 data set's own datum, which is not published. There is no IMU.
 
 A sweep holds the points of two LiDARs of 32 beams, one above the other: lasers 0 to 31 are up_lidar, the others
-down_lidar. av2-api says of sweeps (``av2.structures.sweep``): the points are in ego axes and egomotion-compensated to the
-stamp of the file's name, the sweep's start, and offset_ns counts from there. A real log shows the same: within 10 m the
+down_lidar. av2-api says of sweeps (``av2.structures.sweep``): the points are in ego axes and compensated to the stamp
+of the file's name, the sweep's start, and offset_ns counts from there. A real log shows the same: within 10 m the
 elevations of each laser's points differ by 0.004 deg if they are seen from where the LiDAR was at their offset, by 0.04
 to 0.1 deg if they are seen from where it was at the stamp; and lasers 32 to 63 have a VLP-32C's elevations in the axes
 of down_lidar. Coordinates have half precision: steps of 3 cm from 32 m on, 6 cm from 64 m on.

@@ -1,8 +1,8 @@
 """Writes frames into a log: each sweep as sensor_msgs/PointCloud2, where its LiDAR sits on /tf_static.
 
 The first sweep of every frame is on /lidar/points, the second on /lidar/1/points and so on, with the header frames
-lidar, lidar_1, ... on base_link. A metadata record ``egoloc:TOPIC`` in front of a topic's first sweep says what messages
-cannot: whether the points are compensated. So neither that nor the LiDAR's pose may change within a log.
+lidar, lidar_1, ... on base_link. A metadata record ``egoloc:TOPIC`` in front of a topic's first sweep says what no
+message can: whether the points are compensated. So neither that nor the LiDAR's pose may change within a log.
 """
 
 from collections.abc import Iterable, Iterator

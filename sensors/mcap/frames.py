@@ -56,9 +56,9 @@ def read_frames(
 ) -> Iterator[Frame]:
     """The LiDAR frames of a log with begin_ns <= t_ns < end_ns in order of t_ns, in bounded memory.
 
-    topic: the LiDARs' topics (one, several, or several between commas); None: every PointCloud2 topic but those in world
-    axes. None of them: no frames. What was left out is warned of at the end. EgolocError where the file is no MCAP log,
-    where a named topic is not there, or where a cloud's fields cannot be understood.
+    topic: the LiDARs' topics (one, several, or several with commas between them); None: every PointCloud2 topic but
+    those in world axes; a log without any has no frames. What was left out is warned of at the end. EgolocError where
+    the file is no MCAP log, a named topic is not there, or a cloud's fields cannot be understood.
     """
     reader = FrameReader(path, topic, begin_ns, end_ns)
     yield from reader.frames()
@@ -244,5 +244,5 @@ def _moved(seen: _Seen, t_ns: int) -> Sweep:
     sweep, later = seen.sweep, seen.t_ns - t_ns
     if not later:
         return sweep
-    offset_ns = sweep.offset_ns.astype(np.int64) + later
+    offset_ns = sweep.offset_ns + np.int32(later)
     return Sweep(sweep.xyz, sweep.T_body_lidar, offset_ns, sweep.intensity, sweep.ring, sweep.compensated)

@@ -1,4 +1,4 @@
-"""Single messages of chosen topics, one after the other, of a file that is too large to hold: for what has no columns."""
+"""Single messages of chosen topics, one after the other, of a file that is too large to hold: for frames."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
