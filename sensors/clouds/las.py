@@ -20,7 +20,8 @@ from pyproj.exceptions import ProjError
 
 from sensors.clouds.cloud import Cloud, Floats, check_room, usable
 from sensors.errors import EgolocError
-from sensors.geodesy import MapFrame, llh_from_map, map_from_llh, utm_frame
+from sensors.geodesy import MapFrame, llh_from_map
+from sensors.maps.placing import placed
 from sensors.records import LeftOut
 
 _CHUNK = 1 << 20
@@ -90,7 +91,8 @@ def _placed(path: Path, crs: CRS, xyz: Floats, frame: MapFrame | None, left_out:
         target = frame or MapFrame("utm", (whole[0], whole[1], 0.0), own.zone, own.south)
         if (target.kind, target.zone, target.south) == ("utm", own.zone, own.south):
             return Cloud(xyz - target.origin, target, None, left_out)
-        return Cloud(map_from_llh(target, llh_from_map(own, xyz)), target, None, left_out)
+        target, xyz = placed(str(path), llh_from_map(own, xyz), target)
+        return Cloud(xyz, target, None, left_out)
     try:
         to_degrees: Callable[..., Any] = Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True).transform
         lon, lat = to_degrees(xyz[:, 0], xyz[:, 1])
@@ -99,8 +101,8 @@ def _placed(path: Path, crs: CRS, xyz: Floats, frame: MapFrame | None, left_out:
     llh = np.stack((np.radians(lat), np.radians(lon), xyz[:, 2]), axis=1)
     if not np.isfinite(llh).all():
         raise EgolocError(f"{path}: CRS {horizontal.name}: expected points that lie in it, some do not")
-    target = frame or utm_frame(llh[0])
-    return Cloud(map_from_llh(target, llh), target, None, left_out)
+    target, xyz = placed(str(path), llh, frame)
+    return Cloud(xyz, target, None, left_out)
 
 
 def _parts(crs: CRS) -> tuple[CRS, float]:
