@@ -118,9 +118,8 @@ def _fields(message: MessageReader) -> list[tuple[str, str, int]]:
         if code in _TYPES and length in (0, 1):  # 0: some drivers leave it so
             found.setdefault(name, (_TYPES[code], offset))
     if missing := [axis for axis in "xyz" if axis not in found or np.dtype(found[axis][0]).kind != "f"]:
-        raise EgolocError(
-            f"field {missing[0]}: expected x, y, z as float32 or float64, got {', '.join(found) or 'none'}"
-        )
+        got = ", ".join(found) or "no fields"
+        raise EgolocError(f"field {missing[0]}: expected x, y, z as float32 or float64, got {got}")
     return [(name, kind, offset) for name, (kind, offset) in found.items()]
 
 
