@@ -1,5 +1,6 @@
 """Point clouds as numpy arrays: .npz with xyz or points (N, 3), or x, y, z (N,); .npy with (N, 3). No pickles."""
 
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -14,7 +15,9 @@ from sensors.geodesy import MapFrame
 
 _NAMES = ("xyz", "points")
 _AXES = ("x", "y", "z")
-_DAMAGE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError)
+_DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, OverflowError, MemoryError, RuntimeError, zlib.error,
+           zipfile.BadZipFile, tokenize.TokenError, SyntaxError)  # fmt: skip
+"""What numpy and zipfile raise for damaged files; the last two where an array's header is no Python dictionary."""
 
 
 def read(path: Path, _: MapFrame | None = None) -> Cloud:

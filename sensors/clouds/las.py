@@ -6,6 +6,7 @@ metres.
 Points marked as withheld are left out.
 """
 
+import os
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +25,8 @@ from sensors.geodesy import MapFrame, llh_from_map
 from sensors.maps.placing import placed
 from sensors.records import LeftOut
 
+_HEAD_1_0, _HEAD = 227, 247
+"""Bytes of a header of version 1.0, and of one of 1.4 as far as its records are told."""
 _CHUNK = 1 << 20
 """Points decompressed at a time."""
 _DAMAGE = (LaspyException, OSError, ValueError, TypeError, LookupError, OverflowError, EOFError, struct.error,
@@ -32,6 +35,7 @@ _DAMAGE = (LaspyException, OSError, ValueError, TypeError, LookupError, Overflow
 
 def read(path: Path, frame: MapFrame | None = None) -> Cloud:
     """The points of a file. frame: the map's; None: the UTM zone of the file's CRS, less whole kilometres."""
+    _check_records(path)
     with _damage(path), laspy.open(path) as source:
         _check_header(path, source.header)
         crs = source.header.parse_crs()
@@ -65,6 +69,23 @@ def _damage(path: Path) -> Iterator[None]:
             raise
         reason = (str(error).splitlines() or [repr(error)])[0][:200]
         raise EgolocError(f"{path}: expected a LAS or LAZ file: {reason}") from None
+
+
+def _check_records(path: Path) -> None:
+    """That the records behind the header can be there, for laspy reads as many as the header claims."""
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+        size = os.fstat(stream.fileno()).st_size
+    if head[:4] != b"LASF" or len(head) < _HEAD_1_0:
+        raise EgolocError(f"{path}: expected a LAS or LAZ file, its first bytes are {head[:8].hex(' ')}")
+    header_size, points_at, records = struct.unpack_from("<HII", head, 94)
+    claims = [("number of variable length records", records, 54, min(points_at, size) - header_size)]
+    if head[25] >= 4 and len(head) == _HEAD:
+        at, extended = struct.unpack_from("<QI", head, 235)
+        claims.append(("number of extended variable length records", extended, 60, size - at))
+    for field, count, least, there in claims:
+        if count and count * least > there:
+            raise EgolocError(f"{path}: {field}: {count} do not fit into the {max(there, 0)} bytes that they have")
 
 
 def _check_header(path: Path, header: laspy.LasHeader) -> None:

@@ -302,7 +302,7 @@ def test_las_knows_its_place(tmp_path: Path, epsg: int | str) -> None:
     assert (own.frame.kind, own.frame.zone) == ("utm", 32)
     assert np.abs(own.xyz[:, :2]).max() < 2000
     np.testing.assert_allclose(llh_from_map(own.frame, own.xyz)[:, :2], llh[:, :2], atol=3e-9)  # 2 cm
-    for frame in (PLACE, MapFrame("enu", (49.0, 8.4, 0.0)), MapFrame("utm", (0.0, 5000000.0, 50.0), 31)):
+    for frame in (PLACE, MapFrame("enu", (49.0, 8.4, 0.0))):
         found = read_cloud(path, frame)
         assert found.frame == frame
         np.testing.assert_allclose(found.xyz, map_from_llh(frame, llh), atol=0.03)
@@ -331,6 +331,12 @@ def test_las_headers_that_cannot_be(tmp_path: Path) -> None:
     data[247:255] = (3).to_bytes(8, "little")
     data[131:139] = struct.pack("<d", np.nan)
     refused(written(tmp_path, "a.las", bytes(data)), "scales: expected finite numbers")
+    data[131:139] = struct.pack("<d", 1e-3)
+    data[100:104] = (10**9).to_bytes(4, "little")
+    refused(written(tmp_path, "a.las", bytes(data)), "number of variable length records: 1000000000 do not fit into")
+    data[100:104] = bytes(4)
+    data[243:247] = (10**9).to_bytes(4, "little")
+    refused(written(tmp_path, "a.las", bytes(data)), "number of extended variable length records: 1000000000 do not")
     refused(written(tmp_path, "a.las", b"LASF"), "expected a LAS or LAZ file")
     refused(written(tmp_path, "a.laz", b"no las"), "expected a LAS or LAZ file")
 
