@@ -3,7 +3,9 @@
 import json
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
+from pyarrow import feather
 
 from replay.cli import main
 from sensors.mcap.frames import read_frames
@@ -16,11 +18,7 @@ AV2 = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
     """Exit code, standard output, standard error of a command."""
-    code = 0
-    try:
-        main([str(word) for word in words])
-    except SystemExit as stop:
-        code = stop.code if isinstance(stop.code, int) else 0
+    code = main([str(word) for word in words])
     printed = capsys.readouterr()
     return code, printed.out, printed.err
 
@@ -78,4 +76,12 @@ def test_a_damaged_sweep_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFi
     code, _, err = run(capsys, "convert", "argoverse2", source, log)
     assert (code, err.count("\n")) == (2, 1)
     assert "city_SE3_egovehicle.feather" in err
+    poses = {name: [0.0] for name in ("qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
+    feather.write_feather(pa.table({"timestamp_ns": [1], "qw": [1.0]} | poses), source / "city_SE3_egovehicle.feather")
+    lidars = {"sensor_name": ["up_lidar", "down_lidar"], "qw": [1.0, 1.0]} | {name: [0.0, 0.0] for name in poses}
+    (source / "calibration").mkdir()
+    feather.write_feather(pa.table(lidars), source / "calibration" / "egovehicle_SE3_sensor.feather")
+    code, _, err = run(capsys, "convert", "argoverse2", source, log)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "1.feather: expected a feather file" in err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]

@@ -7,7 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # fmt: skip
+PLY_TYPES = {
+    "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float",
+    "f8": "double",
+}  # fmt: skip
 
 
 def lzf_literals(data: bytes) -> bytes:
@@ -110,7 +113,8 @@ def ply(points: NDArray[np.void], form: str, before: Sequence[tuple[str, bytes]]
 
 def points(xyz: NDArray[Any], kind: str = "f4", order: str = "xyz", **columns: tuple[str, Any]) -> NDArray[np.void]:
     """Structured points, axes in the given order, further fields in front of them."""
-    made = np.zeros(len(xyz), [(n, *k) if isinstance(k, tuple) else (n, f"<{k}") for n, (k, _) in columns.items()] + [(a, f"<{kind}") for a in order])  # fmt: skip
+    fields: list[Any] = [(n, *k) if isinstance(k, tuple) else (n, f"<{k}") for n, (k, _) in columns.items()]
+    made = np.zeros(len(xyz), fields + [(axis, f"<{kind}") for axis in order])
     for axis in order:
         made[axis] = xyz[:, "xyz".index(axis)]
     for name, (_, values) in columns.items():

@@ -13,9 +13,9 @@ from sensors.datasets import frames, load
 from sensors.datasets.argoverse2 import POSES, SWEEPS
 from sensors.errors import EgolocError
 from sensors.geodesy import llh_from_map
+from sensors.maps.ground_height import ground_height
 from sensors.mcap.frames import read_frames
 from sensors.mcap.io import read_log, write_log
-from sensors.maps.ground_height import ground_height
 from sensors.records import Frame, Trajectory
 from sensors.rotation import interpolate_q, matrix_from_q
 
@@ -109,7 +109,7 @@ def _elevation_spread(world: Floats, sweep: object, R: Floats, p: Floats) -> flo
 
 
 def test_sweeps_lie_on_the_ground_and_on_each_other(data: Path) -> None:
-    """Points by the poses, against the log's raster of ground heights (0.3 m cells), and one sweep against the other."""
+    """Points by the poses, against the log's raster of ground heights (0.3 m cells), and sweep against sweep."""
     folder = data / "av2" / WITH_SWEEPS
     reference = load("argoverse2", folder).reference
     assert reference is not None
