@@ -20,6 +20,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
 from sensors.clouds.cloud import Cloud, Floats, check_room, usable
+from sensors.clouds.laz import check_chunks
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame, llh_from_map
 from sensors.maps.placing import placed
@@ -38,6 +39,8 @@ def read(path: Path, frame: MapFrame | None = None) -> Cloud:
     _check_records(path)
     with _damage(path), laspy.open(path) as source:
         _check_header(path, source.header)
+        if source.header.are_points_compressed and source.header.point_count:
+            check_chunks(path, source.header)
         crs = source.header.parse_crs()
         parts, withheld = [np.zeros((0, 3))], 0
         for chunk in source.chunk_iterator(_CHUNK):

@@ -320,6 +320,34 @@ def test_las_of_another_place_than_the_map(tmp_path: Path) -> None:
         read_cloud(path, MapFrame("utm", zone=17))
 
 
+@pytest.mark.parametrize("format", [0, 1, 3, 6, 7, 8])
+@pytest.mark.parametrize("extra", [False, True])
+def test_laz_of_every_format_and_its_claims(tmp_path: Path, format: int, extra: bool) -> None:
+    """Several chunks come back; a layer, a chunk or a table that claims too much is refused before it is read."""
+    header = laspy.LasHeader(point_format=format, version="1.4")
+    header.scales = np.array([1e-3] * 3)
+    if extra:
+        header.add_extra_dim(laspy.ExtraBytesParams("quality", np.uint16))
+    made = laspy.LasData(header)
+    xyz = np.random.default_rng(1).normal(size=(50_010, 3)).round(3)
+    made.x, made.y, made.z = xyz.T
+    stream = BytesIO()
+    made.write(stream, do_compress=True)
+    data = stream.getvalue()
+    np.testing.assert_allclose(read_cloud(written(tmp_path, "a.laz", data)).xyz, xyz, atol=1e-9)
+    at = int.from_bytes(data[96:100], "little")
+    table = int.from_bytes(data[at : at + 8], "little")
+    many = data[: table + 4] + (1 << 31).to_bytes(4, "little") + data[table + 8 :]
+    refused(written(tmp_path, "a.laz", many), "chunk table: 2147483648 chunks for 50010 points")
+    refused(written(tmp_path, "a.laz", data[:at] + bytes(8) + data[at + 8 :]), "chunk table: expected it in the file's")
+    refused(written(tmp_path, "a.laz", data[: at + 500]), "chunk table: expected it in the file's")
+    if format >= 6:
+        layer = at + 8 + header.point_format.size + 4
+        for k in range(9):
+            spoiled = data[: layer + 4 * k] + (1 << 31).to_bytes(4, "little") + data[layer + 4 * k + 4 :]
+            refused(written(tmp_path, "a.laz", spoiled), "chunk 0: its layers claim more than its")
+
+
 def test_las_headers_that_cannot_be(tmp_path: Path) -> None:
     data = bytearray(las(XYZ))
     data[247:255] = (10**12).to_bytes(8, "little")
@@ -404,13 +432,11 @@ def test_damaged_anywhere_is_points_or_one_line(tmp_path: Path, name: str) -> No
         "a.ply": ply(points(xyz), "binary_little_endian"), "t.ply": ply(points(xyz), "ascii"),
         "a.npz": buffer.getvalue(), "a.npy": plain.getvalue(),
     }[name]  # fmt: skip
-    # inside LAZ points lazrs takes sizes as they are, up to 4 GB, and seconds to find that they are not there
-    open_part = int.from_bytes(data[96:100], "little") if name == "a.laz" else len(data)
     failed = 0
     for k in range(150):
         spoiled = bytearray(data)
         for _ in range(rng.integers(1, 4)):
-            spoiled[rng.integers(min(len(data), 600 if k % 2 else open_part))] = rng.integers(256)
+            spoiled[rng.integers(min(len(data), 600 if k % 2 else len(data)))] = rng.integers(256)
         if k % 5 == 0:
             del spoiled[rng.integers(len(data)) :]
         path = written(tmp_path, name, bytes(spoiled))
