@@ -2,11 +2,25 @@
 
 import struct
 from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
+from pyproj import CRS
 
+from sensors.clouds import read_cloud
+from sensors.errors import EgolocError
+
+XYZ = np.array([[1.5, -2.25, 3.0], [400.125, 0.0, -7.5], [0.0, 0.0, 0.0]])
+CLOUDS = hnp.arrays(np.float64, st.tuples(st.integers(0, 30), st.just(3)), elements=st.floats(-1e6, 1e6, width=32))
+quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 PLY_TYPES = {
     "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float",
     "f8": "double",
@@ -120,3 +134,31 @@ def points(xyz: NDArray[Any], kind: str = "f4", order: str = "xyz", **columns: t
     for name, (_, values) in columns.items():
         made[name] = values
     return made
+
+
+def written(folder: Path, name: str, data: bytes) -> Path:
+    path = folder / name
+    path.write_bytes(data)
+    return path
+
+
+def refused(path: Path, told: str) -> None:
+    with pytest.raises(EgolocError, match=told) as raised:
+        read_cloud(path)
+    assert str(raised.value).startswith(f"{path}: ")
+    assert "\n" not in str(raised.value)
+
+
+def las(xyz: Any, epsg: int | str | None = None, compress: bool = False, **fields: Any) -> bytes:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.array([1e-7, 1e-7, 1e-3] if epsg == 4326 else [1e-3] * 3)
+    header.offsets = np.floor(np.asarray(xyz)[0]) if len(xyz) else np.zeros(3)
+    if epsg is not None:
+        header.add_crs(CRS.from_user_input(epsg))
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = np.asarray(xyz).T
+    for name, values in fields.items():
+        setattr(made, name, values)
+    stream = BytesIO()
+    made.write(stream, do_compress=compress)
+    return stream.getvalue()
