@@ -46,7 +46,7 @@ def bins(boxes: Ints, columns: int, first: Ints, items: Ints) -> None:
 
 @kernel(inline="always")
 def _on_ground(ground: Floats, i: int, j: int, u: float, v: float, z: float, d: Any, cell: float, last: float) -> float:
-    """Distance to a patch from shares u, v of its cell and height z, or inf. d: direction; last: m to the cell's end."""
+    """Distance to a patch from shares u, v of its cell and height z, or inf. d: direction; last: m to its end."""
     a, b, c = ground[i, j], ground[i + 1, j] - ground[i, j], ground[i, j + 1] - ground[i, j]
     twist = ground[i + 1, j + 1] - ground[i, j + 1] - b
     du, dv = d[0] / cell, d[1] / cell
@@ -56,13 +56,14 @@ def _on_ground(ground: Floats, i: int, j: int, u: float, v: float, z: float, d: 
     if above > 0.0 and square <= 0.0 and above + last * (slope + last * square) > 0.0:
         return math.inf
     if square == 0.0:
-        return _between(-above / slope if slope != 0.0 else math.inf, last)
+        only: float = _between(-above / slope if slope != 0.0 else math.inf, last)
+        return only
     root = slope * slope - 4.0 * square * above
     if root < 0.0:
         return math.inf
     q = -0.5 * (slope + math.copysign(math.sqrt(root), slope))
-    far = _between(q / square, last)
-    near = _between(above / q, last) if q != 0.0 else math.inf
+    far: float = _between(q / square, last)
+    near: float = _between(above / q, last) if q != 0.0 else math.inf
     return min(near, far)
 
 
@@ -134,7 +135,7 @@ def _first_hit(
     """Distance, number and cosine of incidence of the first thing on a ray from p along the unit vector d."""
     rows, columns = ground.shape[0] - 1, ground.shape[1] - 1
     x, y = (p[0] - corner[0]) / cell, (p[1] - corner[1]) / cell
-    i, j = int(math.floor(x)), int(math.floor(y))
+    i, j = math.floor(x), math.floor(y)
     step_i, step_j = 1 if d[0] > 0.0 else -1, 1 if d[1] > 0.0 else -1
     across_i = cell / abs(d[0]) if d[0] != 0.0 else math.inf
     across_j = cell / abs(d[1]) if d[1] != 0.0 else math.inf
@@ -176,14 +177,14 @@ def _paint(
     x: float, y: float, corner: Any, cell: float, columns: int, strips: Floats, first: Ints, items: Ints
 ) -> float:
     """Reflectivity of the paint at a place on the ground, or -1: none."""
-    number = int(math.floor((x - corner[0]) / cell)) * columns + int(math.floor((y - corner[1]) / cell))
+    number = math.floor((x - corner[0]) / cell) * columns + math.floor((y - corner[1]) / cell)
     for k in range(first[number], first[number + 1]):
         strip = strips[items[k]]
         dx, dy = x - strip[0], y - strip[1]
         along, across = dx * strip[2] + dy * strip[3], dy * strip[2] - dx * strip[3]
         inside = 0.0 <= along <= strip[4] and abs(across) <= strip[5]
         if inside and (along + strip[6]) % strip[7] <= strip[8]:
-            return strip[9]
+            return float(strip[9])
     return -1.0
 
 

@@ -28,23 +28,26 @@ class Clearance(NamedTuple):
     @classmethod
     def of(cls, others: list[Floats], turns: list[Floats]) -> "Clearance":
         """others: middles (n, 2) m of the streets nearby; turns: (n, 2) m."""
-        none = [np.full((1, 2), np.inf)[:0]]
+        none = [np.empty((0, 2))]
         return cls(cKDTree(np.concatenate(others or none)), cKDTree(np.concatenate(turns or none)))
 
     def off_streets(self, xy: Floats) -> Mask:
         """Which places (N, 2) m lie outside of the other streets."""
-        return _distance(self.others, xy, HALF_WIDTH_M) >= HALF_WIDTH_M
+        clear: Mask = _distance(self.others, xy, HALF_WIDTH_M) >= HALF_WIDTH_M
+        return clear
 
     def at(self, xy: Floats, margin: float) -> Mask:
         """Which places (N, 2) m lie so many metres outside of all that."""
         wide, narrow = HALF_WIDTH_M + margin, TURN_M + margin
-        return (_distance(self.others, xy, wide) >= wide) & (_distance(self.turns, xy, narrow) >= narrow)
+        off: Mask = _distance(self.others, xy, wide) >= wide
+        return off & (_distance(self.turns, xy, narrow) >= narrow)
 
     def fits(self, corners: Floats, margin: float) -> Mask:
         """(N,) which quadrilaterals (N, 4, 2) m lie outside, by their corners, the middles of sides, and theirs."""
         sides = 0.5 * (corners + np.roll(corners, 1, axis=1))
         points = np.concatenate((corners, sides, corners.mean(axis=1, keepdims=True)), axis=1)
-        return self.at(points.reshape(-1, 2), margin).reshape(len(corners), -1).all(axis=1)
+        clear: Mask = np.all(self.at(points.reshape(-1, 2), margin).reshape(points.shape[:2]), axis=1)
+        return clear
 
 
 def _distance(tree: cKDTree, xy: Floats, most: float) -> Floats:

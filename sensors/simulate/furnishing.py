@@ -107,7 +107,7 @@ def _junctions(streets: Streets, begin: Floats, end: Floats) -> list[Block]:
     blocks = []
     for at, ahead in ((begin, 1.0), (end, -1.0)):
         w, far, lane = HALF_WIDTH_M, CROSSING_M * ahead, 0.5 * LANE_M
-        stop = [(4.0 * ahead, lane * ahead), (4.0 * ahead, -w * ahead)]
+        stop = [(4.0 * ahead, -lane * ahead), (4.0 * ahead, w * ahead)]  # who comes in keeps to the right
         crossing = [(0.0, -w), (0.0, w), (far, w), (far, -w), (0.0, -w)]
         arrow = [(14.0 * ahead, 0.0), (10.0 * ahead, 0.0), (10.5 * ahead, -0.25)]
         blocks += [

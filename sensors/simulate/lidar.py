@@ -56,9 +56,8 @@ def beams(columns: int) -> Floats:
 
 def column_times(config: LidarSimulation) -> Nanoseconds:
     """(columns,) ns from the begin of a turn."""
-    times: Nanoseconds = np.rint(np.arange(config.columns) * (NS_PER_S / config.rate_hz / config.columns)).astype(
-        np.int64
-    )
+    step_ns = NS_PER_S / config.rate_hz / config.columns
+    times: Nanoseconds = np.rint(np.arange(config.columns) * step_ns).astype(np.int64)
     return times
 
 
@@ -83,7 +82,7 @@ def _measured(hits: Hits, rays: Floats, T_body_lidar: Floats, config: LidarSimul
     column, ring = np.nonzero(heard)
     distance = hits.distance[heard] + config.range_sigma_m * noise[1][heard]
     # the sensor makes up for distance, not for incidence
-    intensity = 100.0 * np.sqrt(hits.reflectivity[heard] * facing[heard]) * (1.0 + config.intensity_sigma * noise[2][heard])
+    intensity = 100.0 * np.sqrt(hits.reflectivity * facing)[heard] * (1.0 + config.intensity_sigma * noise[2][heard])
     return Sweep(
         xyz=(rays[heard] * distance[:, None]).astype(np.float32),
         T_body_lidar=T_body_lidar,

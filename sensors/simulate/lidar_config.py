@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from sensors.bounds import Fraction, Lever, NonNegative, Positive, check_order
+from sensors.bounds import Fraction, Lever, NonNegative, check_order
 
 Vector3 = tuple[Lever, Lever, Lever]
 

@@ -45,8 +45,8 @@ def joined_solids(several: list[Solids]) -> Solids:
 
 
 class Hits(NamedTuple):
-    """What rays (M, K) hit. distance: m, inf: nothing; cosine: of the incidence; reflectivity: -; what: NOTHING, GROUND,
-    or FIRST and the thing's number: plates, then posts, then balls."""
+    """What rays (M, K) hit. distance: m, inf: nothing; cosine: of the incidence; reflectivity: -; what: NOTHING,
+    GROUND, or FIRST and the thing's number: plates, then posts, then balls."""
 
     distance: Floats
     cosine: Floats

@@ -1,4 +1,4 @@
-"""What a LiDAR sees of a street: its furnishing as solid things and paint, and what no map knows: houses, cars, trees."""
+"""What a LiDAR sees of a street: its furnishing as things and paint, and what no map knows: houses, cars, trees."""
 
 from typing import NamedTuple
 
@@ -38,8 +38,8 @@ END_M = 20.0
 
 
 class Footprints(NamedTuple):
-    """Upright boxes. middle: (N, 3) m on the ground; cos, sin: (N,) of their length; size: (N, 3) length, width, height;
-    lift: (N,) m of their lower side over the middle."""
+    """Upright boxes. middle: (N, 3) m on the ground; cos, sin: (N,) of their course; size: (N, 3) m length, width and
+    height; lift: (N,) m of their lower side over the middle."""
 
     middle: Floats
     cos: Floats
@@ -86,7 +86,8 @@ def houses(streets: Streets, rng: Rng) -> tuple[Footprints, Floats]:
     size = rng.uniform((8.0, 8.0, 4.0), (18.0, 12.0, 14.0), (count, 3))
     offset = side * (rng.uniform(11.0, 17.0, count) + size[:, 1] / 2)
     # the floor lies below the ground at every corner: no ray sees under a house on a slope
-    there = Footprints(streets.points(s, offset), *streets.course(s), size + (0.0, 0.0, 2.0), np.full(count, -2.0))
+    size[:, 2] += 2.0
+    there = Footprints(streets.points(s, offset), *streets.course(s), size, np.full(count, -2.0))
     bright = rng.uniform(0.2, 0.6, count)
     keep = rng.random(count) < BUILT
     return there.chosen(keep), bright[keep]

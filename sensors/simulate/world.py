@@ -23,7 +23,7 @@ from sensors.simulate.noise import stream
 from sensors.simulate.plane import Plane
 from sensors.simulate.scene import CELL_M, Scene, Solids, joined_solids
 from sensors.simulate.solids import cars, furnished, houses, trees
-from sensors.simulate.street_lines import Streets, rounded, streets
+from sensors.simulate.street_lines import rounded, streets
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -100,7 +100,7 @@ class World:
         last = last + 1
         i, j = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True)), indexing="ij")
         ground = self._heights(i.ravel(), j.ravel()).reshape(i.shape)
-        corner = first * CELL_M
+        corner: Floats = first.astype(np.float64) * CELL_M
         there = joined_solids([self.street(edge).solids for edge in self.near(corner, last * CELL_M)])
         return Scene.of(corner, ground, there)
 
@@ -173,7 +173,7 @@ class World:
         """(TILE, TILE) m, heights of a square."""
         axis = np.arange(TILE)
         i, j = np.meshgrid(tile_i * TILE + axis, tile_j * TILE + axis, indexing="ij")
-        xy = CELL_M * np.stack((i.ravel(), j.ravel()), axis=-1)
+        xy = CELL_M * np.stack((i.ravel(), j.ravel()), axis=-1).astype(np.float64)
         level = llh_from_map(self.frame, np.column_stack((xy, np.full(len(xy), self._plane.origin[2]))))
         plane = self._plane.xyz(level)
         ground = self._plane.origin[2] + self.network.ground.at(plane[:, :2]) - self.frame.origin[2] - BODY_M
