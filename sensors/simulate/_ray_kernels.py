@@ -169,6 +169,8 @@ def _first_hit(
             i, next_i = i + step_i, next_i + across_i
         else:
             j, next_j = j + step_j, next_j + across_j
+    if begin < best:  # the ray left the grid: what it would hit of things that reach beyond is not known of others
+        return most, NOTHING, 0.0
     return best, what, cosine
 
 

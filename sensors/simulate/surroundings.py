@@ -26,16 +26,14 @@ def drive_frames(duration_s: float | None, seed: int, config: DriveConfig) -> It
     All drives of a network see the same world, that of the network's seed.
     Raises EgolocError, before the first frame is asked for, where the drive follows no network.
     """
-    _check(config)
-    planned = plan(duration_s, seed, config)
-    return frames(_world(planned, config), planned.truth, planned.duration_s, config.lidar, seed)
+    planned = _planned(duration_s, seed, config)
+    return frames(drive_world(planned, config), planned.truth, planned.duration_s, config.lidar, seed)
 
 
 def drive_map(duration_s: float | None, seed: int, config: DriveConfig) -> VectorMap:
     """Where things truly are along that drive, in the map frame of its log."""
-    _check(config)
-    planned = plan(duration_s, seed, config)
-    world = _world(planned, config)
+    planned = _planned(duration_s, seed, config)
+    world = drive_world(planned, config)
     truth = planned.truth
     t_ns = truth.start_ns + np.arange(0, int(planned.duration_s) + 1) * NS_PER_S
     # a second of driving is less than MAPPED_M
@@ -43,15 +41,16 @@ def drive_map(duration_s: float | None, seed: int, config: DriveConfig) -> Vecto
     return world.vector_map(world.along(way, MAPPED_M))
 
 
-def _check(config: DriveConfig) -> None:
-    if config.network is None:
-        raise EgolocError("network: expected a [network] of roads (other drives have no streets around them), got none")
-
-
-def _world(planned: PlannedDrive, config: DriveConfig) -> World:
-    """The world that a drive lies in."""
+def drive_world(planned: PlannedDrive, config: DriveConfig) -> World:
+    """The world that a drive over a network lies in, in the map frame of its log."""
     assert config.network is not None
     start = config.start
     llh = np.radians(start.latitude_deg), np.radians(start.longitude_deg), start.height_m
     network = build_network(config.network, config.environments or {"city": Environment()}, config.network_seed)
     return World(network, llh, map_frame(planned.truth, config.map_frame), config.network_seed)
+
+
+def _planned(duration_s: float | None, seed: int, config: DriveConfig) -> PlannedDrive:
+    if config.network is None:
+        raise EgolocError("network: expected a [network] of roads (other drives have no streets around them), got none")
+    return plan(duration_s, seed, config)
