@@ -224,12 +224,32 @@ class BenchMaps:
         _timed("maps", lambda: maps.run(self.repeats, self.km), self.json)
 
 
+@dataclass(frozen=True)
+class BenchLidar:
+    """Time and returns of the simulated LiDAR's sweeps, and what the world around costs, on one core."""
+
+    repeats: Number = 3
+    """Timed calls at each place, of which the least time counts."""
+    sweeps: Number = 20
+    """Places."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import lidar
+
+        _at_least_one(repeats=self.repeats, sweeps=self.sweeps)
+        _timed("lidar", lambda: lidar.run(self.repeats, self.sweeps), self.json)
+
+
 BENCHMARKS = {
     "filter": BenchFilter,
     "live": BenchLive,
     "replay": BenchReplay,
     "mcap": BenchMcap,
     "maps": BenchMaps,
+    "lidar": BenchLidar,
     "gates": BenchGates,
     "faults": BenchFaults,
     "hidden": BenchHidden,

@@ -38,8 +38,10 @@ HEARD = 0.1
 """Reflectivity that is just heard at the farthest range, -."""
 FULL = 255.0
 """Greatest intensity; 100 is that of a white surface met head on (reflectivity in percent)."""
-SCENE_M, MOVED_M = 40.0, 60.0
-"""A scene reaches so far beyond the range, and is made anew after so much way, m."""
+MOVED_M = 60.0
+"""A scene is made anew after so much way, m."""
+SCENE_REACH_M = MOVED_M + 40.0
+"""It reaches so far beyond the range: what is passed until then, and a turn at 140 km/h of the slowest LiDAR, m."""
 
 
 @lru_cache(maxsize=4)
@@ -108,7 +110,7 @@ def frames(world: World, truth: Truth, duration_s: float, config: LidarSimulatio
         p_map, R_map_body = poses(truth, world.frame, t_ns + offsets)
         here = p_map[len(p_map) // 2, :2]
         if scene is None or not np.hypot(*(here - made_at)) < MOVED_M:
-            scene, made_at = world.scene(here, config.range_max_m + MOVED_M + SCENE_M), here
+            scene, made_at = world.scene(here, config.range_max_m + SCENE_REACH_M), here
         rng = np.random.default_rng([seed, *b"lidar", number])
         arrival_ns = t_ns + round((turn_s + config.delay_s) * NS_PER_S)
         yield Frame(t_ns, arrival_ns, (sweep(scene, p_map, R_map_body, config, rng),))

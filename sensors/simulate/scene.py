@@ -1,6 +1,8 @@
 """A scene that rays are cast into: ground, paint on it, and plates, posts and balls, sorted into cells of a grid.
 
-Measured before this was written: embreex (Intel Embree) on the same scene as triangles; see docs/simulation.md.
+embreex (Intel Embree, 84,000 triangles of the same scene, one core) was tried first: 12 ms for distances of 72,000 rays
+and another 12 ms for what they hit, 6 ms to make the rays and 150 ms a scene, against 13 ms and 4 ms a scene here, where
+ground and posts are curved and distances are doubles. So it is no dependency.
 """
 
 from dataclasses import dataclass

@@ -38,7 +38,8 @@ NEIGHBOURS = 8
 """Places of roads that have a say in the height of one bank."""
 AROUND_M = 30.0
 """Of a street that its furniture takes at most, to either side, m."""
-KEPT_STREETS, KEPT_TILES = 2000, 4000
+KEPT_STREETS, KEPT_TILES = 500, 4000
+"""Streets and tiles that are kept once made: some 100 MB."""
 
 
 class Middle(NamedTuple):
