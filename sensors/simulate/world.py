@@ -175,10 +175,10 @@ class World:
         axis = np.arange(TILE)
         i, j = np.meshgrid(tile_i * TILE + axis, tile_j * TILE + axis, indexing="ij")
         xy = CELL_M * np.stack((i.ravel(), j.ravel()), axis=-1).astype(np.float64)
-        level = llh_from_map(self.frame, np.column_stack((xy, np.full(len(xy), self._plane.origin[2]))))
-        plane = self._plane.xyz(level)
-        ground = self._plane.origin[2] + self.network.ground.at(plane[:, :2]) - self.frame.origin[2] - BODY_M
-        height: Floats = (ground + self._banks(xy)).reshape(TILE, TILE)
+        # heights over the plane's origin, of the level z = 0 and of the ground
+        level = self._plane.xyz(llh_from_map(self.frame, np.column_stack((xy, np.zeros(len(xy))))))
+        ground = self.network.ground.at(level[:, :2]) + self._banks(xy) - BODY_M
+        height: Floats = (ground - level[:, 2]).reshape(TILE, TILE)
         return height
 
     def _banks(self, xy: Floats) -> Floats:
