@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from replay.commands.benching import BENCHMARKS
+from replay.commands.benchmarks import BENCHMARKS
 from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
