@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from replay.commands.bench_run import Hours, Number, above_zero, at_least_one, printed, timed
+from replay.commands.output import print_json, stage
 from sensors.errors import EgolocError
 
 
