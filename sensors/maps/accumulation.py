@@ -49,7 +49,7 @@ class Placed(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Accumulation:
-    """Frames on a trajectory of the body's origin, from ``accumulation``; left_out counts what was not used, and why."""
+    """Frames on a trajectory of the body's origin, from ``accumulation``; left_out counts what was not used."""
 
     t_ns: Nanoseconds
     p: Floats

@@ -80,7 +80,9 @@ def around(street: Street, laps: float, speed: float = 8.0, length: float = 60.0
     return Trajectory(t, t, p, q_from_rpy(wobble, 0.5 * wobble, yaw))
 
 
-def _rectangle(s: Floats, straight: Floats, radius: float, length: float, width: float) -> tuple[Floats, Floats, Floats]:
+def _rectangle(
+    s: Floats, straight: Floats, radius: float, length: float, width: float
+) -> tuple[Floats, Floats, Floats]:
     corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (np.array([length, width]) / 2 - radius)
     x, y, yaw = np.zeros_like(s), np.zeros_like(s), np.zeros_like(s)
     begin = 0.0
