@@ -48,7 +48,7 @@ def _row(slots: Ints, keys: Ints, used: int, key: int) -> int:
         slots[slot, 0], slots[slot, 1] = key, used
         keys[used] = key
         return used
-    return slots[slot, 1]
+    return int(slots[slot, 1])
 
 
 @kernel()

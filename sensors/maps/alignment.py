@@ -111,7 +111,9 @@ def align(
     """
     config = config or AlignConfig()
     steps = accumulation(trajectory, arm, reach)
-    scans, t_ns, poses = Scans(), [], []
+    scans = Scans()
+    t_ns: list[int] = []
+    poses: list[Floats] = []
     for placed in steps.placed(frames):
         if t_ns and not _moved(poses[-1], placed.T_map_body, placed.frame_ns - t_ns[-1], config):
             continue

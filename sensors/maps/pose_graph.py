@@ -179,11 +179,13 @@ def _marginals(factor: SuperLU, count: int) -> Floats:
     right = np.clip(np.searchsorted(nodes, np.arange(count)), 1 if len(nodes) > 1 else 0, len(nodes) - 1)
     left = np.maximum(right - 1, 0)
     share = (np.arange(count) - nodes[left]) / np.maximum(nodes[right] - nodes[left], 1)
-    return found[left] + share[:, None, None] * (found[right] - found[left])
+    between: Floats = found[left] + share[:, None, None] * (found[right] - found[left])
+    return between
 
 
 def _cross(v: Floats) -> Floats:
     """(N, 3, 3) matrices of the product v x . of (N, 3)."""
     zero = np.zeros(len(v))
     x, y, z = v.T
-    return np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=-1).reshape(-1, 3, 3)
+    matrices: Floats = np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=-1).reshape(-1, 3, 3)
+    return matrices

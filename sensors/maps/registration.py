@@ -17,7 +17,7 @@ NEIGHBOURS = 10
 ITERATIONS = 30
 STEP_RAD, STEP_M = 1e-5, 1e-4
 """A smaller step ends a registration."""
-FLOOR = np.repeat((np.radians(0.01), 0.006), 3)
+FLOOR: Floats = np.repeat((np.radians(0.01), 0.006), 3)
 """Standard deviation of what no residual shows, (6,) rad, m: beams that graze, uneven sampling."""
 USUAL_COST = 0.25
 """Squared distance of planes, in small_gicp's unit, where they fit; more of it inflates the covariance."""
@@ -148,6 +148,5 @@ def _align(target: Scan, source: Scan, guess: Floats, distance: float) -> Any:
 
 def _covariance(H: Floats, cost: float) -> Floats:
     """(6, 6); directions that nothing holds get 10 rad or 10 m."""
-    known = np.linalg.inv(H + 1e-2 * np.eye(6))
-    cov: Floats = known * max(1.0, cost / USUAL_COST) + np.diag(FLOOR**2)
-    return (cov + cov.T) / 2.0
+    known: Floats = np.linalg.inv(H + 1e-2 * np.eye(6)).astype(np.float64)
+    return (known + known.T) / 2.0 * max(1.0, cost / USUAL_COST) + np.diag(FLOOR**2)

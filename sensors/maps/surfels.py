@@ -62,8 +62,8 @@ def surfels_in(voxels: Voxels, config: SurfelConfig, least_sightings: int = 1) -
 
 def _planes(voxels: Voxels, rows: NDArray[np.int64], kept: NDArray[np.bool_], config: SurfelConfig) -> Surfels:
     """The thin planes among the windows of these voxels."""
-    count, mean, cov = voxels.windows(rows, kept, config.overlap)
-    enough = count >= config.min_points
+    points, mean, cov = voxels.windows(rows, kept, config.overlap)
+    enough = points >= config.min_points
     mean, cov = mean[enough], cov[enough]
     values, vectors = np.linalg.eigh(cov)
     first, second, third = np.maximum(values, 0.0).T

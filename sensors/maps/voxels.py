@@ -3,7 +3,7 @@
 The order of the points changes nothing but the rounding.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,13 +27,12 @@ Ints = NDArray[np.int64]
 
 FIRST_ROOM = 1 << 14
 """Voxels that a new cloud has room for."""
-LONG_AGO = -(2**62)
 
 
 class Moments(NamedTuple):
-    """Of the points of W windows. count: (W,); mean: (W, 3) m in the map; cov: (W, 3, 3) m^2, by the count."""
+    """Of W windows. points: (W,) how many; mean: (W, 3) m in the map; cov: (W, 3, 3) m^2, divided by how many."""
 
-    count: Floats
+    points: Floats
     mean: Floats
     cov: Floats
 
@@ -49,6 +48,10 @@ class Voxels:
         self._apart_ns = round(apart_s * 1e9)
         self._origin: Ints | None = None
         self._used = 0
+        self._keys: Ints = np.empty(0, np.int64)
+        self._moments: Floats = np.empty((0, 10))
+        self._seen_ns: Ints = np.empty(0, np.int64)
+        self._sightings: NDArray[np.int32] = np.empty(0, np.int32)
         self._room(FIRST_ROOM)
 
     def __len__(self) -> int:
@@ -120,7 +123,8 @@ class Voxels:
         mask = (1 << X_BITS) - 1
         place = np.stack((keys >> (X_BITS + Z_BITS), keys >> Z_BITS & mask, keys & (1 << Z_BITS) - 1), axis=-1)
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
-        return (place - (HALF_X, HALF_X, HALF_Z) + origin + 0.5) * self.voxel_m
+        middles: Floats = (place - (HALF_X, HALF_X, HALF_Z) + origin + 0.5) * self.voxel_m
+        return middles
 
     def _place(self, points: Floats) -> Ints | None:
         """The voxel of the first point, from which places are counted."""
@@ -128,22 +132,17 @@ class Voxels:
             return None
         if not (np.abs(points[0]) < 1e9).all():
             self._refuse(points[0])
-        return np.floor(points[0] / self.voxel_m).astype(np.int64)
+        place: Ints = np.floor(points[0] / self.voxel_m).astype(np.int64)
+        return place
 
     def _room(self, room: int) -> None:
         """Make room for so many voxels."""
-        used = self._used
-        old = (self._keys, self._moments, self._seen_ns, self._sightings) if used else None
-        self._keys = np.zeros(room, np.int64)
-        self._moments = np.zeros((room, 10))
-        self._seen_ns = np.full(room, LONG_AGO, np.int64)
-        self._sightings = np.zeros(room, np.int32)
-        if old is not None:
-            self._keys[:used], self._moments[:used], self._seen_ns[:used], self._sightings[:used] = (
-                column[:used] for column in old
-            )
+        self._keys = _longer(self._keys, room)
+        self._moments = _longer(self._moments, room)
+        self._seen_ns = _longer(self._seen_ns, room)
+        self._sightings = _longer(self._sightings, room)
         self._slots = np.full((2 * room, 2), FREE, np.int64)
-        enter_keys(self._slots, self._keys, used)
+        enter_keys(self._slots, self._keys, self._used)
 
     def _refuse(self, point: Floats) -> None:
         if not np.isfinite(point).all():
@@ -153,3 +152,10 @@ class Voxels:
             f"points: expected one place on the earth, got one more than {side:.0f} km aside or {height:.0f} m above "
             f"or below the first: {point}"
         )
+
+
+def _longer(column: NDArray[Any], room: int) -> NDArray[Any]:
+    """A column with zeros behind it."""
+    longer = np.zeros((room, *column.shape[1:]), column.dtype)
+    longer[: len(column)] = column
+    return longer
