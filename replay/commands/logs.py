@@ -11,7 +11,7 @@ from replay.commands.output import print_json, stage
 from sensors.errors import EgolocError
 
 if TYPE_CHECKING:  # records bring numpy along
-    from sensors.records import Log
+    from sensors.records import Frame, Log
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Convert:
     """Turn a recorded drive of another format into an MCAP log with ROS 2 messages."""
 
     format: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FORMAT")]
-    """rtklib, imu-gnss-drive, comma2k19, novatel, rosbag or gtsam-kitti."""
+    """rtklib, imu-gnss-drive, comma2k19, novatel, rosbag, gtsam-kitti or argoverse2."""
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SRC")]
     """The file or folder to read."""
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
@@ -35,7 +35,7 @@ class Convert:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Read, write, and say what was read."""
-        from sensors.datasets import load
+        from sensors.datasets import frames, load
 
         _check_new(self.log, overwrite=self.overwrite)
         if self.log.exists() and self.source.exists() and self.log.samefile(self.source):
@@ -46,7 +46,7 @@ class Convert:
                 from replay.harness import with_reference
 
                 log = with_reference(log, self.reference, log.map_frame)
-        _write((log,), self.log, "writing", as_json=self.json)
+        _write((log,), self.log, "writing", as_json=self.json, frames=frames(self.format, self.source))
 
 
 @dataclass(frozen=True)
@@ -112,15 +112,16 @@ class Info:
             print_inventory(found)
 
 
-def _write(pieces: "Iterable[Log]", path: Path, doing: str, *, as_json: bool) -> None:
-    """Write the pieces of a drive as they come, and say what it holds."""
+def _write(pieces: "Iterable[Log]", path: Path, doing: str, *, as_json: bool, frames: "Iterable[Frame]" = ()) -> None:
+    """Write the pieces and the frames of a drive as they come, and say what it holds."""
     from replay.inventory import Inventory, print_inventory
+    from replay.lidar_inventory import FrameCount
     from sensors.mcap.io import write_log
 
-    held = Inventory()
+    held, seen = Inventory(), FrameCount()
     with stage(f"{doing} {path}"):
-        write_log(path, held.watch(pieces))
-    found = held.found(str(path))
+        write_log(path, held.watch(pieces), frames=seen.watch(frames))
+    found = held.found(str(path)) | {"frames": seen.found()}
     if as_json:
         print_json(found)
     else:
