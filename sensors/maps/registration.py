@@ -150,3 +150,18 @@ def _covariance(H: Floats, cost: float) -> Floats:
     """(6, 6); directions that nothing holds get 10 rad or 10 m."""
     known: Floats = np.linalg.inv(H + 1e-2 * np.eye(6)).astype(np.float64)
     return (known + known.T) / 2.0 * max(1.0, cost / USUAL_COST) + np.diag(FLOOR**2)
+
+
+def sampled(p: Floats, normal: Floats, spacing_m: float) -> Floats:
+    """(25 K, 3) points on discs of surfels (K, 3): squares of 5 x 5 points, so that each tells its plane.
+
+    spacing_m: between them.
+    """
+    aside = np.where(np.abs(normal[:, 2:]) < 0.7, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    first = np.cross(normal, aside)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normal, first)
+    steps = spacing_m / 2.0 * np.arange(-2.0, 3.0)
+    u, v = (grid.ravel()[None, :, None] for grid in np.meshgrid(steps, steps))
+    points: Floats = p[:, None, :] + u * first[:, None, :] + v * second[:, None, :]
+    return points.reshape(-1, 3)
