@@ -19,6 +19,8 @@ FULL, WRONG = -1, -2
 """Instead of a row: the table must grow; the point is not finite or too far."""
 X_BITS, Z_BITS = 24, 15
 """Of a voxel's place, x or y and z; half of them on either side of the origin."""
+MARGIN = 16
+"""Places at the border that are not used: a window reaches no farther."""
 HALF_X, HALF_Z = 1 << (X_BITS - 1), 1 << (Z_BITS - 1)
 
 
@@ -71,7 +73,7 @@ def add_points(
     origin: (3,) the voxel that places count from. seen_ns: (M,) the latest sighting that was counted; one counts when
     it comes apart_ns or more after the one before. The last row is FULL or WRONG where it stopped.
     """
-    most_x, most_z = HALF_X - 2, HALF_Z - 2
+    most_x, most_z = HALF_X - MARGIN, HALF_Z - MARGIN
     per_m = 1.0 / voxel
     last_key, row = -1, 0
     for n in range(begin, len(xyz)):
@@ -119,24 +121,51 @@ def enter_keys(slots: Ints, keys: Ints, used: int) -> None:
 
 
 @kernel()
-def add_window(
-    slots: Ints, rows: Ints, keys: Ints, moments: Floats, kept: Any, voxel: float, reach: int, out: Floats
-) -> None:
-    """Moments (W, 10) of windows of reach^3 voxels, whose least corners are the voxels of rows (W,).
+def add_windows(
+    slots: Ints,
+    rows: Ints,
+    keys: Ints,
+    moments: Floats,
+    kept: Any,
+    voxel: float,
+    reach: int,
+    least: float,
+    corners: Ints,
+    out: Floats,
+) -> int:
+    """Write keys (W,) of the least corners and moments (W, 10) of windows of reach^3 voxels; returns how many.
 
-    They count from the middle of that corner voxel. kept: (M,) bool, voxels that count.
+    Those with `least` points or more whose first voxel that counts is one of rows (R,): so each window comes once.
+    Moments count from the middle of the corner voxel. kept: (M,) bool, voxels that count. Room for R reach^3 windows.
     """
-    for w in range(len(rows)):
-        key = keys[rows[w]]
-        out[w] = 0.0
-        for i in range(reach):
-            for j in range(reach):
-                for k in range(reach):
-                    # neighbours' keys differ by fixed numbers: the outermost places are never used
-                    other = key + (i << (X_BITS + Z_BITS)) + (j << Z_BITS) + k
-                    row = slots[_slot(slots, other), 1]
-                    if row != FREE and kept[row]:
-                        _add_shifted(moments[row], i * voxel, j * voxel, k * voxel, out[w])
+    written = 0
+    size = reach * reach * reach
+    for row in rows:
+        for shift in range(size):
+            corner = keys[row] - _step(shift, reach)
+            out[written] = 0.0
+            own = False
+            for member in range(size):
+                # neighbours' keys differ by fixed numbers: the outermost places are never used
+                other = slots[_slot(slots, corner + _step(member, reach)), 1]
+                if other == FREE or not kept[other]:
+                    continue
+                if not own and other != row:
+                    break
+                own = True
+                i, j, k = member // (reach * reach), member // reach % reach, member % reach
+                _add_shifted(moments[other], i * voxel, j * voxel, k * voxel, out[written])
+            if own and out[written, 0] >= least:
+                corners[written] = corner
+                written += 1
+    return written
+
+
+@kernel(inline="always")
+def _step(member: int, reach: int) -> int:
+    """From the key of a window's least corner to that of one of its voxels."""
+    i, j, k = member // (reach * reach), member // reach % reach, member % reach
+    return (i << (X_BITS + Z_BITS)) + (j << Z_BITS) + k
 
 
 @kernel(inline="always")

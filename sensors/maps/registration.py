@@ -19,8 +19,12 @@ STEP_RAD, STEP_M = 1e-5, 1e-4
 """A smaller step ends a registration."""
 FLOOR: Floats = np.repeat((np.radians(0.01), 0.006), 3)
 """Standard deviation of what no residual shows, (6,) rad, m: beams that graze, uneven sampling."""
+UNKNOWN: Floats = 100.0 * np.eye(6)
+"""Covariance of what is refused."""
 USUAL_COST = 0.25
 """Squared distance of planes, in small_gicp's unit, where they fit; more of it inflates the covariance."""
+FEIGNED = 0.003
+"""Of all information, what normals with errors of 3 deg seem to give in a direction that they do not tell."""
 
 
 class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -109,7 +113,7 @@ def register(target: Scan, source: Scan, guess: Floats, config: RegistrationConf
     Generalized ICP. The covariance is that of its normal equations, more where planes fit badly, and FLOOR.
     """
     if min(len(target), len(source)) < config.min_points:
-        return Match(guess, np.diag(FLOOR**2), 0.0, np.nan, f"fewer than {config.min_points} points")
+        return Match(guess, UNKNOWN, 0.0, np.nan, f"fewer than {config.min_points} points")
     T, found = guess, None
     for distance in (config.fine_m,) if sure else (config.coarse_m, config.fine_m):
         found = _align(target, source, T, distance)
@@ -122,7 +126,8 @@ def register(target: Scan, source: Scan, guess: Floats, config: RegistrationConf
         refused = "did not converge"
     elif inliers < config.min_inliers:
         refused = f"less than {100 * config.min_inliers:.0f} % of the points found a partner"
-    return Match(T, _covariance(found.H, cost), inliers, float(np.sqrt(cost * PLANE_M2)), refused)
+    cov = UNKNOWN if refused else _covariance(found.H, cost)
+    return Match(T, cov, inliers, float(np.sqrt(cost * PLANE_M2)), refused)
 
 
 PLANE_M2 = 2e-3
@@ -147,9 +152,18 @@ def _align(target: Scan, source: Scan, guess: Floats, distance: float) -> Any:
 
 
 def _covariance(H: Floats, cost: float) -> Floats:
-    """(6, 6); directions that nothing holds get 10 rad or 10 m."""
-    known: Floats = np.linalg.inv(H + 1e-2 * np.eye(6)).astype(np.float64)
-    return (known + known.T) / 2.0 * max(1.0, cost / USUAL_COST) + np.diag(FLOOR**2)
+    """(6, 6) of normal equations H, rotation first; along what nothing holds 10 m.
+
+    Planes estimated from noisy points err by some degrees, which looks like knowledge along a corridor: as much as
+    they would feign is taken off in every direction.
+    """
+    reach = np.sqrt(np.trace(H[:3, :3]) / np.trace(H[3:, 3:]))
+    scale = np.repeat((1.0 / reach, 1.0), 3)
+    values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
+    held = np.maximum(values - FEIGNED * np.trace(H[3:, 3:]), 1e-2)
+    root = scale[:, None] * vectors / np.sqrt(held)
+    cov: Floats = root @ root.T * max(1.0, cost / USUAL_COST) + np.diag(FLOOR**2)
+    return cov
 
 
 def sampled(p: Floats, normal: Floats, spacing_m: float) -> Floats:

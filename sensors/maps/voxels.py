@@ -18,7 +18,7 @@ from sensors.maps._voxel_kernels import (
     X_BITS,
     Z_BITS,
     add_points,
-    add_window,
+    add_windows,
     enter_keys,
 )
 
@@ -30,11 +30,13 @@ FIRST_ROOM = 1 << 14
 
 
 class Moments(NamedTuple):
-    """Of W windows. points: (W,) how many; mean: (W, 3) m in the map; cov: (W, 3, 3) m^2, divided by how many."""
+    """Of W windows. points: (W,) how many; mean: (W, 3) m in the map; cov: (W, 3, 3) m^2, divided by how many;
+    middle: (W, 3) m, of the window."""
 
     points: Floats
     mean: Floats
     cov: Floats
+    middle: Floats
 
 
 class Voxels:
@@ -98,28 +100,28 @@ class Voxels:
         """(M,) how often each was sighted."""
         return self._sightings[: self._used]
 
-    def windows(self, rows: Ints, kept: NDArray[np.bool_], reach: int) -> Moments:
-        """Moments of cubes of reach^3 voxels with the voxels of rows (W,) at their least corners.
+    def windows(self, rows: Ints, kept: NDArray[np.bool_], reach: int, min_points: int) -> Moments:
+        """Cubes of reach^3 voxels, in all places, with min_points or more: those whose first voxel is one of rows (R,).
 
         kept: (M,) which voxels count. reach 1: the voxels themselves.
         """
-        assert self._origin is not None or not len(rows)
-        sums = np.empty((len(rows), 10))
-        add_window(self._slots, rows, self._keys, self._moments, kept, self.voxel_m, reach, sums)
-        count = sums[:, 0]
-        mean = sums[:, 1:4] / np.maximum(count, 1.0)[:, None]
-        upper = sums[:, 4:] / np.maximum(count, 1.0)[:, None]
+        sums = np.empty((len(rows) * reach**3 + 1, 10))
+        corners = np.empty(len(sums), np.int64)
+        table = (self._slots, rows, self._keys, self._moments, kept)
+        count = add_windows(*table, self.voxel_m, reach, float(min_points), corners, sums)
+        points, corner = sums[:count, 0], self._middles(corners[:count])
+        mean = sums[:count, 1:4] / points[:, None]
+        upper = sums[:count, 4:] / points[:, None]
         cov = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
-        return Moments(count, mean + self._middles(rows), cov)
+        return Moments(points, corner + mean, cov, corner + (reach - 1) / 2.0 * self.voxel_m)
 
     def means(self) -> Floats:
         """(M, 3) m, mean of the points of each voxel: a thinned cloud."""
         moments = self._moments[: self._used]
-        return self._middles(np.arange(self._used)) + moments[:, 1:4] / moments[:, :1]
+        return self._middles(self._keys[: self._used]) + moments[:, 1:4] / moments[:, :1]
 
-    def _middles(self, rows: Ints) -> Floats:
+    def _middles(self, keys: Ints) -> Floats:
         """(W, 3) m, middles of voxels."""
-        keys = self._keys[rows]
         mask = (1 << X_BITS) - 1
         place = np.stack((keys >> (X_BITS + Z_BITS), keys >> Z_BITS & mask, keys & (1 << Z_BITS) - 1), axis=-1)
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
