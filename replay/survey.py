@@ -93,7 +93,10 @@ def read_drive(
 def survey_drive(drive: Drive, config: SurfelConfig, reach: Reach, tell: Tell) -> Survey:
     """Surfels of a drive's frames, of what stands still where the drive is long enough to tell."""
     voxels = Voxels(config.window_m / config.overlap, APART_S)
-    steps = accumulation(drive.trajectory, drive.vehicle.reference_lever_arm, reach)
+    try:
+        steps = accumulation(drive.trajectory, drive.vehicle.reference_lever_arm, reach)
+    except EgolocError as error:
+        raise EgolocError(f"{drive.path}: {error}") from None
     points, stamps = 0, []
     for placed in steps.placed(read_frames(drive.path, drive.lidar)):
         voxels.add(placed.xyz, placed.frame_ns)

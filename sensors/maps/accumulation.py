@@ -55,6 +55,7 @@ class Accumulation:
     p: Floats
     R: Floats
     turn: Floats
+    gap_ns: float
     reach: Reach
     left_out: Counter[str] = field(default_factory=Counter)
 
@@ -89,7 +90,7 @@ class Accumulation:
         left = max(int(np.searchsorted(self.t_ns, min(first, frame.t_ns), side="right")) - 1, 0)
         right = int(np.searchsorted(self.t_ns, max(last, frame.t_ns), side="left"))
         widest = np.diff(self.t_ns[left : right + 1]).max(initial=0)
-        return "in a gap of the trajectory" if widest > _gap_ns(self.t_ns) else None
+        return "in a gap of the trajectory" if widest > self.gap_ns else None
 
     def _in_map(self, frame: Frame) -> Floats:
         parts = []
@@ -125,7 +126,8 @@ def accumulation(trajectory: Trajectory, arm: Vector3 = (0.0, 0.0, 0.0), reach: 
     vector = Rotation.from_matrix(R[:-1].transpose(0, 2, 1) @ R[1:]).as_rotvec()
     angle = np.linalg.norm(vector, axis=1, keepdims=True)
     axis = np.divide(vector, angle, out=np.zeros_like(vector), where=angle > 0.0)
-    return Accumulation(rows.t_ns, np.ascontiguousarray(p), R, np.hstack((axis, angle)), reach or Reach())
+    turn = np.hstack((axis, angle))
+    return Accumulation(rows.t_ns, np.ascontiguousarray(p), R, turn, _gap_ns(rows.t_ns), reach or Reach())
 
 
 def _gap_ns(t_ns: Nanoseconds) -> float:

@@ -35,10 +35,12 @@ def test_normals_and_places_of_a_noisy_plane(normal: tuple[float, float, float])
     n = np.array(normal) / np.linalg.norm(normal)
     assert len(surfels) >= 9
     angle = np.degrees(np.arccos(np.clip(np.abs(surfels.normal @ n), 0.0, 1.0)))
-    assert np.sqrt(np.mean(angle**2)) < 1.0
+    assert np.median(angle) < 0.8
+    # ten points of 2 cm on a strip of 0.1 m, the least that counts: 3.6 deg
+    assert angle.max() < 4.0
     away = (np.column_stack((surfels.p, surfels.z)) - centre) @ n
-    # ten points or more of 2 cm in each
-    assert np.sqrt(np.mean(away**2)) < 0.007
+    assert np.sqrt(np.mean(away**2)) < 0.005
+    assert abs(np.mean(away)) < 0.002
     assert (surfels.ratios[:, 0] <= 0.1).all()
     assert (surfels.ratios[:, 1] <= surfels.ratios[:, 0]).all()
     assert (surfels.normal[:, 2] >= 0.0).all()
