@@ -164,7 +164,7 @@ WRONG = [
     ([Surfels, "{f}/none.npz", "{t}/m", "--frame", "enu:49,8"], "none.npz: no such file"),
     ([Surfels, "{f}/ground.npz", "{f}/lines.parquet", "--frame", "enu:49,8"], "exists already"),
     ([Surfels, "{f}/ground.npz", "{t}/m", "--cell-m", "0"], "--cell-m: expected 0.1..100, got 0"),
-    ([Surfels, "{f}/ground.npz", "{t}/m", "--map", "{f}/lines.parquet", "--frame", "enu:49,8"], "expected map frame enu:49,8,0"),
+    ([Surfels, "{f}/ground.npz", "{t}/m", "--map", "{f}/other.parquet", "--frame", "enu:49,8"], "map frame enu:49"),
     ([Surfels, "{f}/ground.npz", "{t}/m", "--trajectory", "{f}/truth.csv"], "--trajectory: expected a log"),
     ([Surfels, "{f}/log.mcap", "{f}/ground.npz", "{t}/m"], "expected clouds or one log"),
     ([Surfels, "{f}/bare.mcap", "{t}/m"], "bare.mcap: expected LiDAR frames along the trajectory, got none"),

@@ -1,14 +1,17 @@
 """Frames in the map: motion compensation, limits, what is left out, and a car that drives through."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sensors.datasets import argoverse2
 from sensors.errors import EgolocError
 from sensors.frames import Frame, Sweep
 from sensors.maps.accumulation import Reach, accumulation
+from sensors.maps.ground_height import ground_height
 from sensors.maps.surfels import SurfelConfig, surfels_in
 from sensors.maps.voxels import Voxels
 from sensors.records import Trajectory
@@ -125,3 +128,19 @@ def test_a_car_that_drives_through_leaves_no_surfels() -> None:
     assert on(3, *lane) == 0
     assert on(3, *parked) >= 4
     assert on(3, *wall) > 25
+
+
+def test_ground_surfels_of_a_real_log_agree_with_its_ground_height(data: Path) -> None:
+    """Two sweeps of an Argoverse 2 log; its raster has steps of 6 cm at this height."""
+    folder = next((data / "av2").glob("7fab2350*"))
+    steps = accumulation(argoverse2.load(folder).reference)
+    voxels = Voxels(0.5)
+    for part in steps.placed(argoverse2.frames(folder)):
+        voxels.add(part.xyz)
+    assert not steps.left_out
+    surfels = surfels_in(voxels, SurfelConfig())
+    above = surfels.z - ground_height(folder / "map", surfels.p)
+    road = (surfels.normal[:, 2] > 0.98) & (np.abs(above) < 0.5)
+    assert road.sum() > 200
+    assert abs(np.median(above[road])) < 0.05
+    assert np.percentile(np.abs(above[road]), 90) < 0.1
