@@ -19,6 +19,8 @@ FULL, WRONG = -1, -2
 """Instead of a row: the table must grow; the point is not finite or too far."""
 X_BITS, Z_BITS = 24, 15
 """Of a voxel's place, x or y and z; half of them on either side of the origin."""
+MIX = 0x1E3779B97F4A7C15
+"""Odd, its bits as good as random."""
 MARGIN = 16
 """Places at the border that are not used: a window reaches no farther."""
 HALF_X, HALF_Z = 1 << (X_BITS - 1), 1 << (Z_BITS - 1)
@@ -34,7 +36,9 @@ def key_of(i: int, j: int, k: int) -> int:
 def _slot(slots: Ints, key: int) -> int:
     """Where a key stands in the table, or would."""
     mask = len(slots) - 1
-    slot = ((key * 0x9E3779B97F4A7C15) >> 20) & mask
+    mixed = key * MIX
+    mixed = (mixed ^ (mixed >> 32)) * MIX  # a product carries only upwards: x must reach the low bits as well
+    slot = (mixed ^ (mixed >> 32)) & mask
     while slots[slot, 1] != FREE and slots[slot, 0] != key:
         slot = (slot + 1) & mask
     return slot
