@@ -18,6 +18,7 @@ from replay.commands.map_check import CheckMap
 from replay.commands.map_files import ExportMap, ImportMap
 from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
+from replay.commands.surveying import Align, Surfels
 from sensors.errors import EgolocError
 
 COMMANDS = {
@@ -32,7 +33,13 @@ COMMANDS = {
     "allan": Allan,
     "noise": Noise,
 }
-MAPS = {"import": ImportMap, "export": ExportMap, "check": CheckMap}
+MAPS = {
+    "import": ImportMap,
+    "check": CheckMap,
+    "surfels": Surfels,
+    "align": Align,
+    "export": ExportMap,
+}
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."
 MAP_DESCRIPTION = "Vector maps: make them, look into them, judge them."
 BENCH_DESCRIPTION = "Measure speed beside other libraries, and how well the filter does where it is hard."
