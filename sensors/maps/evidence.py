@@ -89,7 +89,8 @@ def evidence(elements: Elements, surfels: Surfels, model: Model) -> Evidence:
     """All that a part of a map tells. Elements that nobody sees (Style.VIRTUAL) are left out."""
     seen = elements.chosen(elements.style != Style.VIRTUAL)
     parts = [_of_points(seen, model), *_of_lines(seen, model), _of_ends(seen, model), _of_surfels(surfels, model)]
-    return Evidence(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    place, normal, weight = (np.concatenate([part[column] for part in parts]) for column in range(3))
+    return Evidence(place, normal, weight, np.concatenate([part.group for part in parts]))
 
 
 def _evidence(place: Floats, normal: Floats, weight: Floats, group: NDArray[np.int64] | int) -> Evidence:
@@ -137,7 +138,7 @@ def _of_lines(elements: Elements, model: Model) -> tuple[Evidence, Evidence]:
     across = np.column_stack((-along[:, 1], along[:, 0]))
     whole = _evidence(place, across, weights[kind] * each / model.piece_m, 0)._replace(group=classes[kind])
     if model.dash_end_m is None:
-        return whole, Evidence(*(column[:0] for column in whole))
+        return whole, _evidence(place[:0], along[:0], each[:0], PAINT)
     dashed = np.isin(lines.style, _DASHED)[row] & (kind == Kind.LANE_LINE)
     ends = 2.0 * each[dashed] / model.dash_period_m
     return whole, _evidence(place[dashed], along[dashed], ends * model.dash_end_m**-2, PAINT)

@@ -68,8 +68,9 @@ def along(opened: MapFile, xy: Floats, heading: Floats, model: Model | None = No
     found = np.empty((len(xy), 3, 3))
     for rows in chunks(xy):
         low, high = xy[rows].min(axis=0), xy[rows].max(axis=0)
+        middle = (low + high) / 2.0
         radius = 0.5 * float(np.hypot(*(high - low))) + math.sqrt(2.0) * model.reach_m + 2.0 * model.join_m + 1.0
-        part = opened.around(*((low + high) / 2.0).tolist(), radius)
+        part = opened.around(float(middle[0]), float(middle[1]), radius)
         found[rows] = information(evidence(*part, model), xy[rows], heading[rows], model)
     return judged(found, model)
 
@@ -144,10 +145,10 @@ def _add_up(  # type: ignore[no-untyped-def]
         half = reach * (abs(cos) + abs(sin))
         count = 0
         x0, y0 = local[pose, 0], local[pose, 1]
-        left = max(int(math.floor((x0 - half) / BUCKET_M)), 0)
-        right = min(int(math.floor((x0 + half) / BUCKET_M)), wide - 1)
-        low = max(int(math.floor((y0 - half) / BUCKET_M)), 0)
-        top = min(int(math.floor((y0 + half) / BUCKET_M)), high - 1)
+        left = max(math.floor((x0 - half) / BUCKET_M), 0)
+        right = min(math.floor((x0 + half) / BUCKET_M), wide - 1)
+        low = max(math.floor((y0 - half) / BUCKET_M), 0)
+        top = min(math.floor((y0 + half) / BUCKET_M), high - 1)
         for row in range(low, top + 1):
             if left > right:
                 break
@@ -157,8 +158,8 @@ def _add_up(  # type: ignore[no-untyped-def]
                 if abs(x) > reach or abs(y) > reach:
                     continue
                 nx, ny = cos * normal[i, 0] + sin * normal[i, 1], cos * normal[i, 1] - sin * normal[i, 0]
-                column = int(math.floor(x / cell + 0.5)) + across // 2
-                line = int(math.floor(y / cell + 0.5)) + across // 2
+                column = math.floor(x / cell + 0.5) + across // 2
+                line = math.floor(y / cell + 0.5) + across // 2
                 g = (group[i] * across + line) * across + column
                 if not used[g]:
                     used[g] = True
