@@ -14,6 +14,8 @@ from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
+from replay.commands.map_check import CheckMap
+from replay.commands.map_files import ExportMap, ImportMap
 from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
 from sensors.errors import EgolocError
@@ -30,7 +32,9 @@ COMMANDS = {
     "allan": Allan,
     "noise": Noise,
 }
+MAPS = {"import": ImportMap, "export": ExportMap, "check": CheckMap}
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."
+MAP_DESCRIPTION = "Vector maps: make them, look into them, judge them."
 BENCH_DESCRIPTION = "Measure speed beside other libraries, and how well the filter does where it is hard."
 
 
@@ -42,8 +46,9 @@ def _one_of(commands: dict[str, Any]) -> Any:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 1 some logs failed, 2 a user's mistake (one line on stderr)."""
     given = tuple(sys.argv[1:] if arguments is None else arguments)
+    maps: Any = Annotated[_one_of(MAPS), tyro.conf.subcommand("map", description=MAP_DESCRIPTION)]
     bench: Any = Annotated[_one_of(BENCHMARKS), tyro.conf.subcommand("bench", description=BENCH_DESCRIPTION)]
-    choices: Any = _one_of(COMMANDS) | bench
+    choices: Any = _one_of(COMMANDS) | maps | bench
     command = tyro.cli(
         choices,
         prog="egoloc",

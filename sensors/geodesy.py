@@ -43,15 +43,18 @@ class MapFrame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise EgolocError(f"map frame: origin: expected latitude and longitude in degrees, got {self.origin}")
 
 
-def utm_frame(llh: ArrayLike) -> MapFrame:
-    """The UTM frame of the zone that holds a point (3,), its origin rounded down to whole kilometres."""
+def utm_frame(llh: ArrayLike, zone: int = 0) -> MapFrame:
+    """The UTM frame of the zone that holds a point (3,), its origin rounded down to whole kilometres.
+
+    zone: another one than the point's, negative in the south; 0: the point's.
+    """
     lat, lon, _ = np.asarray(llh, np.float64)
     if not abs(lat) <= np.radians(84.5):
         raise EgolocError(f"UTM: expected a latitude within 84 deg, got {np.degrees(lat):.3f}")
-    zone = int((np.degrees(lon) + 180.0) // 6.0) % 60 + 1
-    whole = MapFrame("utm", zone=zone, south=bool(lat < 0))
+    own = int((np.degrees(lon) + 180.0) // 6.0) % 60 + 1
+    whole = MapFrame("utm", zone=abs(zone) or own, south=bool(lat < 0 if zone == 0 else zone < 0))
     x, y, _ = map_from_llh(whole, np.atleast_2d(llh))[0]
-    return MapFrame("utm", (float(x // 1000 * 1000), float(y // 1000 * 1000), 0.0), zone, whole.south)
+    return MapFrame("utm", (float(x // 1000 * 1000), float(y // 1000 * 1000), 0.0), whole.zone, whole.south)
 
 
 def ecef_from_llh(llh: ArrayLike) -> Floats:

@@ -224,12 +224,32 @@ class BenchMaps:
         _timed("maps", lambda: maps.run(self.repeats, self.km), self.json)
 
 
+@dataclass(frozen=True)
+class BenchImports:
+    """Time to import maps of other formats, their size, and how exactly they come back, on one core."""
+
+    sources: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SRC...")]
+    """Maps of any format that egoloc map import knows."""
+    repeats: Number = 5
+    """Timed imports of each, after one that warms up; the median counts."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import imports
+
+        _at_least_one(repeats=self.repeats, sources=len(self.sources))
+        _timed("imports", lambda: imports.run(self.sources, self.repeats), self.json)
+
+
 BENCHMARKS = {
     "filter": BenchFilter,
     "live": BenchLive,
     "replay": BenchReplay,
     "mcap": BenchMcap,
     "maps": BenchMaps,
+    "imports": BenchImports,
     "gates": BenchGates,
     "faults": BenchFaults,
     "hidden": BenchHidden,

@@ -1,24 +1,19 @@
-"""From a map file's own projection, a PROJ string or WKT, to the map's frame.
+"""A map file's own projection, a PROJ string or WKT. ``sensors.maps.placing`` brings what it gives into a map's frame.
 
 Heights pass through: a geoid named in the projection is not applied, and the importer says so.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from sensors.errors import EgolocError
-from sensors.geodesy import MapFrame, map_from_llh, utm_frame
 from sensors.maps.vector_map import Floats
 
 VERTICAL = ("+geoidgrids", "+vunits", "+vto_meter")
-FAR_M = 500e3
-"""A plane tangent at a datum is no map at this distance from it; a UTM zone ends before."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,36 +47,3 @@ def georeference(text: str, path: Path) -> Georeference:
     signed = int(zone[:-1]) * (-1 if zone[-1] == "S" else 1) if zone else 0
     transformer = Transformer.from_crs(crs.to_2d(), CRS.from_epsg(4326), always_xy=True)
     return Georeference(path, transformer, signed, "geoidgrids" in text)
-
-
-def placed(
-    reference: Georeference | None, xyz: Floats, frame: MapFrame | None, path: Path
-) -> tuple[MapFrame, Callable[[Floats], Floats]]:
-    """The map's frame, and what brings the file's coordinates (N, 3) into it.
-
-    xyz: (N, 3) the file's coordinates. frame None: the file's own UTM zone, else that of its middle; without a
-    georeference a local plane whose datum is not known (0, 0). Raises EgolocError where the file cannot be brought
-    into frame.
-    """
-    if reference is None:
-        if frame is not None:
-            raise EgolocError(f"{path}: has no georeference, so it cannot be brought into a {frame.kind} frame")
-        return MapFrame("enu"), lambda points: points
-    middle = reference.llh(0.5 * (xyz.min(axis=0) + xyz.max(axis=0))[None]) if len(xyz) else np.zeros((1, 3))
-    own = _own_frame(reference, middle)
-    target = frame or own
-    if target.kind == "utm" and target.zone != own.zone:
-        raise EgolocError(f"{path}: expected a map in UTM zone {target.zone}, got one in zone {own.zone}")
-    off = np.linalg.norm(map_from_llh(target, middle)[0, :2])
-    if target.kind == "enu" and len(xyz) and off > FAR_M:
-        raise EgolocError(f"{path}: expected a map within {FAR_M / 1e3:.0f} km of the datum, got {off / 1e3:.0f} km")
-    return target, lambda points: map_from_llh(target, reference.llh(points))
-
-
-def _own_frame(reference: Georeference, middle: Floats) -> MapFrame:
-    """UTM, its origin on whole kilometres near the middle (1, 3) llh."""
-    if not reference.zone:
-        return utm_frame(middle[0])
-    frame = MapFrame("utm", zone=abs(reference.zone), south=reference.zone < 0)
-    x, y, _ = map_from_llh(frame, middle)[0]
-    return msgspec.structs.replace(frame, origin=(float(x // 1000 * 1000), float(y // 1000 * 1000), 0.0))

@@ -2,7 +2,6 @@
 
 import os
 from collections import OrderedDict
-from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
@@ -15,8 +14,9 @@ from numpy.typing import NDArray
 
 from sensors.errors import EgolocError
 from sensors.maps.columns import FACTS_KEY, SCHEMA, VERSION, WORDS, Facts, tile_of
+from sensors.maps.joining import joined_elements, joined_surfels
 from sensors.maps.quantized import m_from_cm
-from sensors.maps.vector_map import NO_ELEMENTS, NO_SURFELS, Elements, Floats, Surfels, VectorMap
+from sensors.maps.vector_map import Elements, Floats, Surfels, VectorMap
 
 CACHE_MB = 64.0
 """Decoded tiles that are kept, MB."""
@@ -65,13 +65,13 @@ class MapFile:
         near = [self._tile(int(number)) for number in np.flatnonzero(_within(self.boxes, x, y, radius))]
         elements = [tile.elements.chosen(_within(tile.boxes, x, y, radius)) for tile in near]
         surfels = [tile.surfels.chosen(_closer(tile.surfels.p, x, y, radius)) for tile in near]
-        return _all_elements(elements), _all_surfels(surfels)
+        return joined_elements(elements), joined_surfels(surfels)
 
     def whole(self) -> VectorMap:
         """All of it, tile by tile; none is kept."""
         tiles = [self._decoded(number) for number in range(len(self.boxes))]
-        elements = _all_elements([tile.elements for tile in tiles])
-        surfels = _all_surfels([tile.surfels for tile in tiles])
+        elements = joined_elements([tile.elements for tile in tiles])
+        surfels = joined_surfels([tile.surfels for tile in tiles])
         return VectorMap(self.frame, elements, surfels, self.facts.sources, self.facts.road_km)
 
     def column_bytes(self) -> dict[str, int]:
@@ -186,22 +186,3 @@ def _closer(p: Floats, x: float, y: float, radius: float) -> NDArray[np.bool_]:
     dx, dy = p[:, 0] - x, p[:, 1] - y
     near: NDArray[np.bool_] = dx * dx + dy * dy <= radius * radius
     return near
-
-
-def _all_elements(parts: Sequence[Elements]) -> Elements:
-    parts = [part for part in parts if len(part)]
-    if len(parts) < 2:
-        return parts[0] if parts else NO_ELEMENTS
-    counts = np.concatenate([np.diff(part.first) for part in parts])
-    kind, style, colour, xyz, source, name = (
-        np.concatenate([getattr(part, column) for part in parts])
-        for column in ("kind", "style", "colour", "xyz", "source", "name")
-    )
-    return Elements(kind, style, colour, np.concatenate(([0], np.cumsum(counts))), xyz, source, name)
-
-
-def _all_surfels(parts: Sequence[Surfels]) -> Surfels:
-    parts = [part for part in parts if len(part)]
-    if len(parts) < 2:
-        return parts[0] if parts else NO_SURFELS
-    return Surfels(*(np.concatenate([getattr(part, column) for part in parts]) for column in Surfels.__slots__))

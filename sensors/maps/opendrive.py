@@ -14,12 +14,13 @@ import numpy as np
 from sensors.errors import EgolocError
 from sensors.geodesy import MapFrame
 from sensors.maps.builder import Builder
-from sensors.maps.georeference import georeference, placed
+from sensors.maps.georeference import georeference
 from sensors.maps.hardened_xml import mistake, number, parse
 from sensors.maps.opendrive_lanes import add_lanes, driving_length
 from sensors.maps.opendrive_objects import add_objects
 from sensors.maps.opendrive_road import Road, read_road
 from sensors.maps.opendrive_signals import add_signals
+from sensors.maps.placing import LOCAL, placed, refuse_frame
 from sensors.maps.vector_map import Floats, VectorMap
 from sensors.records import LeftOut
 
@@ -83,15 +84,18 @@ def _in_frame(
     if reference is not None and reference.geoid:
         builder.leave_out("geoids of the georeference: heights stay above the geoid")
     shifted = _shift(root.find("header/offset"))
-    local = builder.built(MapFrame("enu"), road_km=road_km)
+    local = builder.built(LOCAL, road_km=road_km)
     world = shifted(local.elements.xyz)
     off = np.abs(world).max(axis=1) > ON_EARTH_M
     if off.any():
         name = local.elements.name[np.searchsorted(local.elements.first, off.argmax(), side="right") - 1]
         raise EgolocError(f"{path}: {name}: expected coordinates within {ON_EARTH_M / 1e3:.0f} km, got {world[off][0]}")
-    target, to_map = placed(reference, world, frame, path)
-    elements = replace(local.elements, xyz=to_map(world) if len(world) else world)
-    return replace(local, frame=target, elements=elements), builder.left_out
+    if reference is None:
+        refuse_frame(str(path), frame)
+        target, xyz = LOCAL, world
+    else:
+        target, xyz = placed(str(path), reference.llh(world), frame, reference.zone)
+    return replace(local, frame=target, elements=replace(local.elements, xyz=xyz)), builder.left_out
 
 
 def _shift(offset: Element | None) -> Callable[[Floats], Floats]:

@@ -18,11 +18,12 @@ PASSES = 3
 """Towards the height of a point of a plane: each makes the rest smaller by the square of its slope."""
 
 
-def placed(where: str, llh: Floats, frame: MapFrame | None) -> tuple[MapFrame, Floats]:
+def placed(where: str, llh: Floats, frame: MapFrame | None, zone: int = 0) -> tuple[MapFrame, Floats]:
     """A frame and (N, 3) coordinates in it of (N, 3) rad, rad, m; heights may be NaN and stay so.
 
-    where: the file, for messages. frame None: the UTM frame of the points' middle. Raises EgolocError for points off
-    the earth, and for a frame that is another place's.
+    where: the file, for messages. frame None: the UTM frame of the points' middle, in the zone that the file is
+    written in, negative in the south, if it reaches so far. Raises EgolocError for points off the earth, and for a
+    frame that is another place's.
     """
     if not len(llh):
         return frame or LOCAL, np.empty((0, 3))
@@ -32,7 +33,7 @@ def placed(where: str, llh: Floats, frame: MapFrame | None) -> tuple[MapFrame, F
         raise EgolocError(f"{where}: expected latitude and longitude in degrees, got {lat:.7g}, {lon:.7g}")
     refuse_far(where, llh[:, 2:])
     if frame is None:
-        frame = _own_frame(where, llh)
+        frame = _own_frame(where, llh, zone)
     _refuse_other_zone(where, llh, frame)
     xyz = map_from_llh(frame, np.column_stack((llh[:, :2], _heights(llh[:, 2], frame))))
     xyz[np.isnan(llh[:, 2]), 2] = np.nan
@@ -42,16 +43,16 @@ def placed(where: str, llh: Floats, frame: MapFrame | None) -> tuple[MapFrame, F
     return frame, xyz
 
 
-def _own_frame(where: str, llh: Floats) -> MapFrame:
+def _own_frame(where: str, llh: Floats, zone: int) -> MapFrame:
     """The UTM frame of the points' middle."""
-    lat, lon = np.median(llh[:, :2], axis=0)
-    if np.abs(llh[:, 1] - lon).max() > np.radians(MAX_FROM_MERIDIAN_DEG):
+    middle = np.array([*np.median(llh[:, :2], axis=0), 0.0])
+    if np.abs(llh[:, 1] - middle[1]).max() > np.radians(MAX_FROM_MERIDIAN_DEG):
         wide = np.degrees(np.ptp(llh[:, 1]))
         raise EgolocError(
             f"{where}: expected a map within one UTM zone, got one that is {wide:.1f} deg of longitude wide"
         )
     try:
-        return utm_frame((lat, lon, 0.0))
+        return utm_frame(middle, zone if _in_zone(llh, abs(zone), zone < 0) else 0)
     except EgolocError as error:
         raise EgolocError(f"{where}: {error}") from error
 
@@ -64,23 +65,28 @@ def refuse_far(where: str, metres: Floats) -> None:
 
 
 def refuse_frame(where: str, frame: MapFrame | None) -> None:
-    """Refuse to bring local coordinates into a frame on the earth."""
-    if frame is not None:
+    """Refuse to bring local coordinates into a frame on the earth; files of one plane may be brought together."""
+    if frame not in (None, LOCAL):
         raise EgolocError(
             f"{where}: has only local coordinates, without georeference: cannot be brought into a map frame"
         )
 
 
 def _refuse_other_zone(where: str, llh: Floats, frame: MapFrame) -> None:
-    if frame.kind != "utm":
-        return
-    lon = np.degrees(llh[:, 1])
-    away = np.abs((lon - (6.0 * frame.zone - 183.0) + 180.0) % 360.0 - 180.0)
-    south = np.median(llh[:, 0]) < 0
-    if away.max() > MAX_FROM_MERIDIAN_DEG or frame.south != south:
-        zone = int((lon[np.argmax(away)] + 180.0) // 6.0) % 60 + 1
-        asked = f"zone {frame.zone}{'S' if frame.south else 'N'}"
-        raise EgolocError(f"{where}: lies in UTM zone {zone}{'S' if south else 'N'}, the map asked for is in {asked}")
+    if frame.kind == "utm" and not _in_zone(llh, frame.zone, frame.south):
+        own = utm_frame(llh[np.argmax(_from_meridian_deg(llh, frame.zone))] * (1.0, 1.0, 0.0))
+        lies, asked = (f"{f.zone}{'S' if f.south else 'N'}" for f in (own, frame))
+        raise EgolocError(f"{where}: lies in UTM zone {lies}, the map asked for is in zone {asked}")
+
+
+def _in_zone(llh: Floats, zone: int, south: bool) -> bool:
+    """Whether a zone reaches all points, with its overlap; they may cross the equator."""
+    return bool(_from_meridian_deg(llh, zone).max() <= MAX_FROM_MERIDIAN_DEG and (np.median(llh[:, 0]) < 0) == south)
+
+
+def _from_meridian_deg(llh: Floats, zone: int) -> Floats:
+    away: Floats = np.abs((np.degrees(llh[:, 1]) - (6.0 * zone - 183.0) + 180.0) % 360.0 - 180.0)
+    return away
 
 
 def geodetic(frame: MapFrame, xyz: Floats) -> Floats:

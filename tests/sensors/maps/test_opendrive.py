@@ -101,13 +101,21 @@ def test_a_map_comes_into_a_frame_or_is_refused(tmp_path: Path) -> None:
     plane, _ = opendrive.read(path, MapFrame("enu", (float(datum[0]), float(datum[1]), 0.0)))
     np.testing.assert_allclose(plane.elements.vertices(0)[0], [0, 0, 0], atol=1e-6)
     assert np.linalg.norm(plane.elements.vertices(0)[1]) == pytest.approx(100.0 / 0.9996, abs=1e-3)
-    with pytest.raises(EgolocError, match=r"map\.xodr: expected a map in UTM zone 33, got one in zone 32"):
+    with pytest.raises(EgolocError, match=r"map\.xodr: lies in UTM zone 32N, the map asked for is in zone 33N"):
         opendrive.read(path, MapFrame("utm", zone=33))
-    with pytest.raises(EgolocError, match=r"expected a map within 500 km of the datum, got \d+ km"):
+    with pytest.raises(EgolocError, match=r"the map asked for is another place's: \d+ km from its datum"):
         opendrive.read(path, MapFrame("enu", (10.0, 20.0, 0.0)))
     bare = written(tmp_path, road(section(RIGHT)))
-    with pytest.raises(EgolocError, match="has no georeference, so it cannot be brought into a utm frame"):
+    with pytest.raises(EgolocError, match="without georeference: cannot be brought into a map frame"):
         opendrive.read(bare, MapFrame("utm", zone=32))
+
+
+def test_a_file_keeps_the_zone_that_it_is_written_in(tmp_path: Path) -> None:
+    """0.2 deg beyond the zone's edge the file's own zone goes on; 3 deg beyond, the place's own is taken."""
+    for x, zone in ((742_500.0, 32), (950_000.0, 33)):
+        geometry = LINE.replace('x="0" y="0"', f'x="{x}" y="5400200"')
+        path = written(tmp_path, road(section(RIGHT), geometry), header=f"<geoReference>{UTM}</geoReference>")
+        assert opendrive.read(path)[0].frame.zone == zone
 
 
 def test_roads_of_junctions_are_no_kilometres(tmp_path: Path) -> None:
