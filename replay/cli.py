@@ -16,6 +16,7 @@ from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
 from replay.commands.map_check import CheckMap
 from replay.commands.map_files import ExportMap, ImportMap
+from replay.commands.mapping import MapInfo
 from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
 from sensors.errors import EgolocError
@@ -32,7 +33,7 @@ COMMANDS = {
     "allan": Allan,
     "noise": Noise,
 }
-MAPS = {"import": ImportMap, "export": ExportMap, "check": CheckMap}
+MAPS = {"import": ImportMap, "info": MapInfo, "export": ExportMap, "check": CheckMap}
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."
 MAP_DESCRIPTION = "Vector maps: make them, look into them, judge them."
 BENCH_DESCRIPTION = "Measure speed beside other libraries, and how well the filter does where it is hard."

@@ -125,9 +125,7 @@ def _summary(
             **dict(zip(AXES, wrong.mean(axis=0).tolist(), strict=True)),
             "any": float(wrong.any(axis=1).mean()),
         },
-        "degenerate_beyond": {
-            UNITS[axis]: model.share * float(getattr(limits, UNITS[axis])) for axis in AXES
-        },
+        "degenerate_beyond": {UNITS[axis]: model.share * float(getattr(limits, UNITS[axis])) for axis in AXES},
         "stretches": stretches(opened, route, found, wrong),
         "model": msgspec.to_builtins(model),
     }

@@ -87,8 +87,8 @@ def _notes(info: Mapping[str, Any]) -> Iterator[str]:
         yield "Localizability is not predicted: the map has no lane line or road boundary to drive along."
         return
     yield (
-        f"Localizability: of {found['poses']:,} poses over {found['route_km']:,.2f} km of {found['route']}; a lower bound "
-        f"on a clear day and an empty road, nothing hidden (docs/maps.md)."
+        f"Localizability: of {found['poses']:,} poses over {found['route_km']:,.2f} km of {found['route']}; a lower "
+        "bound on a clear day and an empty road, nothing hidden (docs/maps.md)."
     )
     yield f"Degenerate along at least one axis: {percent(found['degenerate']['any'])} % of the way."
     yield from (f"Source: {source}." for source in info["sources"])

@@ -65,6 +65,3 @@ class MapInfo:
         for option, path, suffix in (("--png", self.png, ".png"), ("--rrd", self.rrd, ".rrd")):
             if path is not None and path.suffix.lower() != suffix:
                 raise EgolocError(f"{option}: expected a file name that ends in {suffix}, got {path}")
-
-
-MAPPING = {"info": MapInfo}
