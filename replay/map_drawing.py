@@ -1,14 +1,16 @@
 """What is drawn of a map, in a picture as in a recording: shapes by kind, and the pieces of its route."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors.maps.columns import SURFEL
 from sensors.maps.map_file import MapFile
 from sensors.maps.route import Route
-from sensors.maps.vector_map import Elements, Kind, Style
+from sensors.maps.vector_map import Elements, Kind, Style, VectorMap
 
 Floats = NDArray[np.float64]
 
@@ -25,6 +27,9 @@ KIND_COLOURS: Mapping[str, str] = {
 MOST_ELEMENTS = 60_000
 """Of a larger map the route alone is drawn: its elements would be smaller than a pixel."""
 MOST_SURFELS = 300_000
+"""Of more, every so many is drawn."""
+MOST_HELD = 3_000_000
+"""Of a map with more surfels the route alone is drawn: decoded they take 64 bytes each."""
 
 
 class Drawn(NamedTuple):
@@ -37,12 +42,10 @@ class Drawn(NamedTuple):
 
 
 def drawn_elements(opened: MapFile) -> Drawn:
-    """The shapes of a map, nothing of one that is too large."""
-    counts = opened.facts.counts
-    surfels = counts.get("surfel", 0)
-    if sum(counts.values()) - surfels > MOST_ELEMENTS or surfels > MOST_SURFELS:
+    """The shapes of a map; nothing of one that is too large."""
+    whole = shown(opened)
+    if whole is None:
         return Drawn({}, {}, np.empty((0, 2)), complete=False)
-    whole = opened.whole()
     lines: dict[str, list[Floats]] = {}
     points: dict[str, Floats] = {}
     for kind, part in by_kind(whole.elements):
@@ -51,6 +54,17 @@ def drawn_elements(opened: MapFile) -> Drawn:
         else:
             lines[kind.name.lower()] = np.split(part.xyz[:, :2], part.first[1:-1])
     return Drawn(lines, points, whole.surfels.p, complete=True)
+
+
+def shown(opened: MapFile) -> VectorMap | None:
+    """The map with as many surfels as can be told apart; None: it is too large."""
+    counts = opened.facts.counts
+    surfels = counts.get(SURFEL, 0)
+    if sum(counts.values()) - surfels > MOST_ELEMENTS or surfels > MOST_HELD:
+        return None
+    whole = opened.whole()
+    step = -(-max(surfels, 1) // MOST_SURFELS)
+    return replace(whole, surfels=whole.surfels.chosen(np.arange(0, surfels, step)))
 
 
 def by_kind(elements: Elements) -> Iterator[tuple[Kind, Elements]]:

@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 
 from replay.config import Limits
 from sensors.errors import EgolocError
-from sensors.geodesy import llh_from_map
-from sensors.maps.columns import SURFEL
+from sensors.geodesy import MapFrame, llh_from_map
+from sensors.maps.columns import KINDS, SURFEL
 from sensors.maps.evidence import Model
-from sensors.maps.localizability import AXES, CHUNK_M, Localizability, along
+from sensors.maps.joining import joined_elements, joined_surfels
+from sensors.maps.localizability import AXES, Localizability, along
 from sensors.maps.map_file import MapFile
 from sensors.maps.placing import LOCAL
 from sensors.maps.route import Route, route_of_map, route_of_trajectory
 from sensors.maps.store import bytes_by_kind
 from sensors.maps.vector_map import VectorMap
+from sensors.pieces import joined
+from sensors.records import Trajectory
 
 Info = dict[str, Any]
 
@@ -27,30 +30,41 @@ WORST = 5
 """Degenerate stretches that are listed, the longest of each axis."""
 WHOLE_ROWS = 400_000
 """A map with more elements and surfels is weighed by samples: all of it would not fit into memory."""
-SAMPLES = 24
+SAMPLES = 8
 """Places at which a large map is weighed, each with what lies within SAMPLE_M of it."""
-SAMPLE_M = CHUNK_M / 2
+SAMPLE_M = 400.0
 UNITS = {"lon": "lon_m", "lat": "lat_m", "yaw": "yaw_deg"}
 SCALE = np.array([1.0, 1.0, 180.0 / np.pi])
 
 
 def route_of(opened: MapFile, source: Path | None) -> Route:
-    """Where a map is judged: along its own lines, or along a trajectory file or a log's reference.
+    """Where a map is judged: along its own lines, a trajectory file, a run's smoothed states or a log's reference.
 
     Raises EgolocError where that cannot be read, has no reference, or is in another frame or place than the map.
     """
     if source is None:
         return route_of_map(opened)
-    if source.suffix.lower() == ".mcap":
-        from sensors.mcap.io import read_log
-
-        log = read_log(source)
-        if log.reference is None or not len(log.reference):
-            raise EgolocError(f"{source}: expected a log with a reference, as a route along the map")
-        return route_of_trajectory(log.reference, str(source), opened, log.map_frame)
+    from sensors.datasets.run_trajectory import is_parquet, read_run_trajectory
     from sensors.datasets.trajectory_file import read_trajectory
 
-    return route_of_trajectory(read_trajectory(source, opened.frame)[0], str(source), opened)
+    if source.suffix.lower() == ".mcap":
+        trajectory, frame = _log_reference(source)
+    elif is_parquet(source):
+        trajectory, frame = read_run_trajectory(source, None, np.zeros(3))
+    else:
+        trajectory, frame = read_trajectory(source, opened.frame)
+    return route_of_trajectory(trajectory, str(source), opened, frame)
+
+
+def _log_reference(path: Path) -> tuple[Trajectory, MapFrame | None]:
+    """The reference of a log and the frame that it is in; what else the log holds is let go of."""
+    from sensors.mcap.io import read_pieces
+
+    pieces = [(piece.reference, piece.map_frame) for piece in read_pieces(path)]
+    parts = [part for part, _ in pieces if part is not None and len(part)]
+    if not parts:
+        raise EgolocError(f"{path}: expected a log with a reference, as a route along the map")
+    return joined(parts), pieces[0][1]
 
 
 def map_info(
@@ -92,16 +106,23 @@ def kind_bytes(opened: MapFile) -> tuple[dict[str, int], str]:
     counts = opened.facts.counts
     if sum(counts.values()) <= WHOLE_ROWS:
         return bytes_by_kind(opened.whole(), opened.facts.tile_m), "whole"
-    sizes, seen = dict.fromkeys(counts, 0), dict.fromkeys(counts, 0)
-    places = np.unique(np.linspace(0, len(opened.boxes) - 1, SAMPLES).astype(np.intp))
-    for x0, y0, x1, y1 in opened.boxes[places].tolist():
-        elements, surfels = opened.around((x0 + x1) / 2, (y0 + y1) / 2, SAMPLE_M)
-        part = VectorMap(opened.frame, elements, surfels, opened.facts.sources)
-        numbers = np.bincount(elements.kind, minlength=len(counts) - 1).tolist()
-        for kind, size in bytes_by_kind(part, opened.facts.tile_m).items():
-            sizes[kind] += size
-            seen[kind] += len(surfels) if kind == SURFEL else numbers[list(counts).index(kind)]
+    parts = [opened.around(x, y, SAMPLE_M) for x, y in _apart((opened.boxes[:, :2] + opened.boxes[:, 2:]) / 2.0)]
+    elements, surfels = joined_elements([part[0] for part in parts]), joined_surfels([part[1] for part in parts])
+    sample = VectorMap(opened.frame, elements, surfels, opened.facts.sources)
+    seen = dict(zip(KINDS, np.bincount(elements.kind, minlength=len(KINDS)).tolist(), strict=True))
+    seen[SURFEL] = len(surfels)
+    sizes = bytes_by_kind(sample, opened.facts.tile_m)
     return {kind: round(size * counts[kind] / max(seen[kind], 1)) for kind, size in sizes.items()}, "samples"
+
+
+def _apart(middles: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """SAMPLES of (T, 2) places at most, spread; what lies about them does not overlap (twice weighs nothing)."""
+    chosen: list[tuple[float, float]] = []
+    spread = np.argsort(np.arange(len(middles)) * 0.618034 % 1.0)  # the golden section: any first few are well spread
+    for x, y in middles[spread].tolist():
+        if len(chosen) < SAMPLES and all(math.hypot(x - a, y - b) > 2.0 * SAMPLE_M for a, b in chosen):
+            chosen.append((x, y))
+    return chosen
 
 
 def _summary(

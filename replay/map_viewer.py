@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from replay.blueprint import FIELD_OF_VIEW, NARROWEST, grid_spacing
-from replay.map_drawing import MOST_ELEMENTS, MOST_SURFELS, by_kind, pieces
+from replay.map_drawing import by_kind, pieces, shown
 from replay.map_info import SCALE, UNITS
 from replay.map_picture import COLOURS, DECADE, TITLES
 from replay.viewer import WRITING_S
@@ -37,8 +37,9 @@ COLOURS_OF: dict[Kind, tuple[int, int, int]] = {
     Kind.POLE: (245, 245, 245),
     Kind.SIGN: (70, 215, 170),
 }
-ROUTE_ABOVE_M = 12.0
-"""The route is drawn so far above the ground near it, so that nothing hides it from above, m."""
+ROUTE_ABOVE = 1 / 400
+"""The route is drawn so far above the ground near it, as a share of the map's size: nothing hides it from above, and
+it does not look shifted."""
 LIGHTER = 0.36
 """Half of the colours' scale that is used: its ends are too dark before a dark ground."""
 
@@ -72,13 +73,11 @@ def write_map_recording(opened: MapFile, route: Route, found: Localizability, in
 def _draw(
     recording: rr.RecordingStream, opened: MapFile, route: Route, found: Localizability, info: "Info", centre: Floats
 ) -> None:
-    counts = opened.facts.counts
-    surfels = counts["surfel"]
-    ground = 0.0
     recording.send_property("map_centre", rr.AnyValues(x_m=centre[0], y_m=centre[1]))
     recording.log("summary", rr.TextDocument(_summary(info), media_type=rr.MediaType.MARKDOWN), static=True)
-    if sum(counts.values()) - surfels <= MOST_ELEMENTS and surfels <= MOST_SURFELS:
-        whole = opened.whole()
+    route_z = np.zeros(len(route))
+    whole = shown(opened)
+    if whole is not None:
         heights = np.concatenate((whole.elements.xyz[:, 2], whole.surfels.z))
         ground = float(np.nanmedian(heights)) if np.isfinite(heights).any() else 0.0
         origin = np.array([*centre, ground])
@@ -87,8 +86,6 @@ def _draw(
         if len(whole.surfels):
             recording.log("map/surfel", _surfels(whole.surfels, origin), static=True)
         route_z = _heights(route, whole.elements, ground)
-    else:
-        route_z = np.zeros(len(route))
     if len(route):
         for axis in AXES:
             recording.log(f"predicted/{axis}", _route(route, found, info, axis, centre, route_z), static=True)
@@ -149,7 +146,8 @@ def _route(route: Route, found: Localizability, info: "Info", axis: str, centre:
     level = 0.5 + LIGHTER * np.clip(np.log(sigma / beyond) / math.log(DECADE), -1.0, 1.0)
     colours = (255.0 * colormaps[COLOURS](level)[:, :3]).astype(np.uint8)
     xy = pieces(route) - centre
-    strips = np.concatenate((xy, np.repeat(z + ROUTE_ABOVE_M, 2).reshape(-1, 2, 1)), axis=2)
+    above = ROUTE_ABOVE * float(np.ptp(route.xy, axis=0).max())
+    strips = np.concatenate((xy, np.repeat(z + above, 2).reshape(-1, 2, 1)), axis=2)
     return rr.LineStrips3D(strips, colors=colours, radii=rr.Radius.ui_points(2.5))
 
 

@@ -23,6 +23,10 @@ _ENDING = (Kind.LANE_LINE, Kind.STOP_LINE, Kind.MARKING)
 _DASHED = (Style.DASHED, Style.DOUBLE_DASHED, Style.DOTS)
 
 
+MOST_PIECES = 10_000
+"""Of one edge of a line: an edge that leads to the other side of the earth is a mistake, and must not fill memory."""
+
+
 class Model(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How well each kind of element is seen: assumptions, not measurements, to be replaced by those of a network.
 
@@ -126,7 +130,7 @@ def _of_lines(elements: Elements, model: Model) -> tuple[Evidence, Evidence]:
     length[lines.first[1:] - 1] = 0.0  # from the end of one line to the beginning of another
     edge = np.flatnonzero(length > 0.0)
     row = np.repeat(np.arange(len(lines)), np.diff(lines.first))[edge]
-    pieces = np.ceil(length[edge] / model.piece_m).astype(np.intp)
+    pieces = np.minimum(np.ceil(length[edge] / model.piece_m), MOST_PIECES).astype(np.intp)
     number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     share = (number + 0.5) / np.repeat(pieces, pieces)
     edge, row = np.repeat(edge, pieces), np.repeat(row, pieces)

@@ -104,8 +104,13 @@ def judged(found: Floats, model: Model) -> Localizability:
 def information(found: Evidence, xy: Floats, heading: Floats, model: Model) -> Floats:
     """(N, 3, 3) information of poses (N, 2) m and (N,) rad from evidence in the same frame."""
     result = np.zeros((len(xy), 3, 3))
-    if not len(found.weight) or not len(xy):
+    if not len(xy):
         return result
+    reach = math.sqrt(2.0) * model.reach_m
+    near = ((found.place >= xy.min(axis=0) - reach) & (found.place <= xy.max(axis=0) + reach)).all(axis=1)
+    if not near.any():
+        return result
+    found = Evidence(found.place[near], found.normal[near], found.weight[near], found.group[near])
     origin = np.minimum(found.place.min(axis=0), xy.min(axis=0))
     cell = np.floor((found.place - origin) / BUCKET_M).astype(np.int64)
     wide, high = (cell.max(axis=0) + 1).tolist()

@@ -1,6 +1,7 @@
 """egoloc map info: figures, tables, pictures, and what it refuses."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from sensors.maps.formats import read_map
 from sensors.maps.map_file import open_map
 from sensors.maps.store import bytes_by_kind, write_map
 from sensors.maps.vector_map import Kind, VectorMap
-from sensors.mcap.io import write_log
+from sensors.mcap.io import read_log, write_log
 from sensors.records import Log, Trajectory
 from sensors.simulate.city_map import city_map
 
@@ -173,8 +174,13 @@ def test_bad_routes_are_one_line(capsys: pytest.CaptureFixture[str], road: Path,
     assert "in the frame of" in refused(capsys, road, "--route", elsewhere)
     local = _log(tmp_path / "b.mcap", MapFrame("enu"), xy)
     assert "local one without a datum" in refused(capsys, road, "--route", local)
-    write_log(tmp_path / "c.mcap", Log(map_frame=UTM, reference=None))
-    assert "c.mcap" in refused(capsys, road, "--route", tmp_path / "c.mcap")
+    simulated = tmp_path / "c.mcap"
+    assert main(["simulate", "static", str(simulated), "--duration-s", "30"]) == 0
+    capsys.readouterr()
+    with_reference = read_log(simulated)
+    write_log(tmp_path / "d.mcap", replace(with_reference, reference=None))
+    assert "d.mcap: expected a log with a reference" in refused(capsys, road, "--route", tmp_path / "d.mcap")
+    assert "smoothed.parquet of a run" in refused(capsys, road, "--route", road)
     (tmp_path / "nan.csv").write_text("t_s,x,y\n0,nan,nan\n1,nan,2\n")
     assert "nan.csv: no usable row" in refused(capsys, road, "--route", tmp_path / "nan.csv")
     (tmp_path / "far.csv").write_text("t_s,x,y\n" + "\n".join(f"{i},{i + 9e5},0" for i in range(50)))
@@ -248,7 +254,7 @@ def test_targets_are_pictures_and_recordings(capsys: pytest.CaptureFixture[str],
 
 
 def test_large_maps_are_weighed_by_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    write_map(city_map(3.0, 3), tmp_path / "a.parquet", 300.0)
+    write_map(city_map(8.0, 3), tmp_path / "a.parquet")
     with open_map(tmp_path / "a.parquet") as opened:
         whole, how = kind_bytes(opened)
         assert how == "whole"

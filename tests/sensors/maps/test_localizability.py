@@ -123,6 +123,12 @@ def test_dashes_count_where_they_are_asked_for() -> None:
     assert info(lines(0.0), weak)[0, 0] == pytest.approx(0.0, abs=1e-9)
 
 
+def test_an_edge_round_the_earth_does_not_fill_memory() -> None:
+    far = elements((Kind.ROAD_BOUNDARY, [(-2e7, 0.0), (2e7, 0.0)]), (Kind.POLE, [(5.0, 0.0)]))
+    assert len(evidence(far, NO_SURFELS, MODEL).weight) == 10_000 + 2
+    assert np.isfinite(info(far)).all()
+
+
 def test_signs_are_at_the_middle_of_their_corners() -> None:
     face = [(10.0, 1.0, 2.0), (10.0, 3.0, 2.0), (10.0, 3.0, 4.0), (10.0, 1.0, 4.0), (10.0, 1.0, 2.0)]
     found = evidence(elements((Kind.SIGN, face), (Kind.SIGN, [(7.0, 7.0)])), NO_SURFELS, MODEL)
