@@ -16,6 +16,7 @@ from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
 from replay.commands.map_check import CheckMap
 from replay.commands.map_files import ExportMap, ImportMap
+from replay.commands.mapping import MapInfo
 from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
 from replay.commands.surveying import Align, Surfels
@@ -35,6 +36,7 @@ COMMANDS = {
 }
 MAPS = {
     "import": ImportMap,
+    "info": MapInfo,
     "check": CheckMap,
     "surfels": Surfels,
     "align": Align,
