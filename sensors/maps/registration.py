@@ -17,8 +17,9 @@ NEIGHBOURS = 10
 ITERATIONS = 30
 STEP_RAD, STEP_M = 1e-5, 1e-4
 """A smaller step ends a registration."""
-FLOOR: Floats = np.repeat((np.radians(0.01), 0.006), 3)
-"""Standard deviation of what no residual shows, (6,) rad, m: beams that graze, uneven sampling."""
+FLOOR: Floats = np.array([*np.radians((0.1, 0.1, 0.01)), 0.006, 0.006, 0.01])
+"""Standard deviation of what no residual shows, (6,) rad, m: beams that graze, uneven sampling. The rings that a LiDAR
+draws on the ground go with it: a scan leans, and lifts, towards the rings of the one a few metres before."""
 UNKNOWN: Floats = 100.0 * np.eye(6)
 """Covariance of what is refused."""
 USUAL_COST = 0.25
