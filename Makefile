@@ -27,6 +27,7 @@ bench: .venv/installed-bench  ## speed, side by side with other libraries
 	$(BIN)/egoloc bench live $(ARGS)
 	$(BIN)/egoloc bench mcap $(ARGS)
 	$(BIN)/egoloc bench replay $(ARGS)
+	$(BIN)/egoloc bench maps $(ARGS)
 
 picture: .venv/installed  ## docs/images/view.png; needs a Vulkan driver (Debian: mesa-vulkan-drivers)
 	$(BIN)/egoloc demo --out runs/demo

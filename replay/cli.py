@@ -9,15 +9,17 @@ from typing import Annotated, Any
 
 import tyro
 
-from replay.commands.benching import BENCHMARKS
+from replay.commands.benchmarks import BENCHMARKS
 from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
 from replay.commands.map_check import CheckMap
 from replay.commands.map_files import ExportMap, ImportMap
+from replay.commands.mapping import MapInfo
 from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
+from replay.commands.surveying import Align, Surfels
 from sensors.errors import EgolocError
 
 COMMANDS = {
@@ -32,7 +34,14 @@ COMMANDS = {
     "allan": Allan,
     "noise": Noise,
 }
-MAPS = {"import": ImportMap, "export": ExportMap, "check": CheckMap}
+MAPS = {
+    "import": ImportMap,
+    "info": MapInfo,
+    "check": CheckMap,
+    "surfels": Surfels,
+    "align": Align,
+    "export": ExportMap,
+}
 DESCRIPTION = "Multi-sensor localization for vehicles: replay logs through the filter and measure how well it does."
 MAP_DESCRIPTION = "Vector maps: make them, look into them, judge them."
 BENCH_DESCRIPTION = "Measure speed beside other libraries, and how well the filter does where it is hard."

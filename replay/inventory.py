@@ -12,6 +12,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from replay.lidar_inventory import file_lidars, frames_text, lidar_text
 from replay.plausibility import ImuWatch
 from replay.references import GAP_NS, GAP_PERIODS
 from replay.requirements import Contents
@@ -170,6 +171,7 @@ def file_inventory(path: Path, topics: Mapping[str, str]) -> dict[str, Any]:
         known = Log(vehicle=summary.vehicle, map_frame=summary.map_frame, left_out=summary.left_out)
         found = inventory(known, str(path)) | {"remarks": [f"Not to be replayed as it is: {summary.conflict}."]}
     found["topics"] = [_topic(topic) for topic in summary.topics]
+    found["lidars"] = file_lidars(path, topics, found["topics"])
     found["file"] = {
         "bytes": summary.size_bytes,
         "complete": summary.complete,
@@ -226,6 +228,10 @@ def print_inventory(found: Mapping[str, Any]) -> None:
         console.print("GNSS: " + ", ".join(f"{n} {status}" for status, n in found["gnss_status"].items()))
     if found["two_modes"]:
         console.print(f"Pose fixes: {found['two_modes']} tell two modes of their posterior")
+    for lidar in found.get("lidars", ()):
+        console.print(lidar_text(lidar))
+    if found.get("frames"):
+        console.print(frames_text(found["frames"]))
     for kind, label in (("scene_s", "Scene"), ("mode_s", "Drive mode")):
         if found[kind]:
             console.print(f"{label}: {_tag_text(found[kind])}")

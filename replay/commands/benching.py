@@ -1,18 +1,15 @@
 """egoloc bench: speed beside other libraries, and how well the filter does where it is hard."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from replay.commands.bench_run import Hours, Number, above_zero, at_least_one, printed, timed
 from replay.commands.output import print_json, stage
 from sensors.errors import EgolocError
-
-Number = Annotated[int, tyro.conf.arg(metavar="N")]
-Hours = Annotated[float, tyro.conf.arg(metavar="H")]
 
 
 @dataclass(frozen=True)
@@ -28,8 +25,8 @@ class BenchFilter:
         """Run the benchmark."""
         from replay.bench import filter
 
-        _at_least_one(repeats=self.repeats)
-        _timed("filter", lambda: filter.run(self.repeats), self.json)
+        at_least_one(repeats=self.repeats)
+        timed("filter", lambda: filter.run(self.repeats), self.json)
 
 
 @dataclass(frozen=True)
@@ -47,9 +44,9 @@ class BenchLive:
         """Run the benchmark."""
         from replay.bench import live
 
-        _at_least_one(repeats=self.repeats)
-        _above_zero(hours=(self.hours,))
-        _timed("live", lambda: live.run(self.repeats, (self.hours,)), self.json)
+        at_least_one(repeats=self.repeats)
+        above_zero(hours=(self.hours,))
+        timed("live", lambda: live.run(self.repeats, (self.hours,)), self.json)
 
 
 @dataclass(frozen=True)
@@ -67,9 +64,9 @@ class BenchReplay:
         """Run the benchmark."""
         from replay.bench import replay
 
-        _at_least_one(repeats=self.repeats)
-        _above_zero(hours=self.hours)
-        _timed("replay", lambda: replay.run(self.repeats, self.hours), self.json)
+        at_least_one(repeats=self.repeats)
+        above_zero(hours=self.hours)
+        timed("replay", lambda: replay.run(self.repeats, self.hours), self.json)
 
 
 @dataclass(frozen=True)
@@ -85,8 +82,8 @@ class BenchMcap:
         """Run the benchmark."""
         from replay.bench import mcap
 
-        _at_least_one(repeats=self.repeats)
-        _timed("mcap", lambda: mcap.run(self.repeats), self.json)
+        at_least_one(repeats=self.repeats)
+        timed("mcap", lambda: mcap.run(self.repeats), self.json)
 
 
 @dataclass(frozen=True)
@@ -102,8 +99,8 @@ class BenchGates:
         """Run the benchmark."""
         from replay.bench import gates
 
-        _at_least_one(drives=self.drives)
-        _printed("gates", lambda _: gates.run(self.drives), gates.table, self.json)
+        at_least_one(drives=self.drives)
+        printed("gates", lambda _: gates.run(self.drives), gates.table, self.json)
 
 
 @dataclass(frozen=True)
@@ -127,7 +124,7 @@ class BenchFaults:
         from replay.fault_tables import fault_tables, markdown
         from replay.table import output_console
 
-        _at_least_one(drives=self.drives)
+        at_least_one(drives=self.drives)
         if self.seed < 0:
             raise EgolocError(f"--seed: expected 0 or more, got {self.seed}")
         with stage("benchmark faults") as tell:
@@ -177,7 +174,7 @@ class BenchHidden:
 
         windows = hidden_windows(self.begin, self.end)
         work = lambda _: hidden.run(self.logs, self.lengths, self.every, windows, self.peers, self.halves)  # noqa: E731
-        _printed("hidden", work, hidden_table, self.json)
+        printed("hidden", work, hidden_table, self.json)
 
 
 @dataclass(frozen=True)
@@ -198,63 +195,10 @@ class BenchConsistency:
         from replay.bench import consistency
         from replay.config import load_config
 
-        _at_least_one(seeds=self.seeds)
+        at_least_one(seeds=self.seeds)
         config = None if self.config is None else load_config(self.config).fusion
         work = lambda tell: consistency.run(self.seeds, config=config, watch=tell)  # noqa: E731
-        _printed("consistency", work, consistency.table, self.json)
-
-
-@dataclass(frozen=True)
-class BenchMaps:
-    """Size of map files by kind and column, and how fast a large one opens and answers, on one core."""
-
-    repeats: Number = 3
-    """Passes over the places that are asked for; of each place its least time counts."""
-    km: Annotated[float, tyro.conf.arg(metavar="KM")] = 1000.0
-    """Streets of the large map, km."""
-    json: bool = False
-    """Print JSON."""
-
-    def run(self, _: tuple[str, ...]) -> None:
-        """Run the benchmark."""
-        from replay.bench import maps
-
-        _at_least_one(repeats=self.repeats)
-        _above_zero(km=(self.km,))
-        _timed("maps", lambda: maps.run(self.repeats, self.km), self.json)
-
-
-@dataclass(frozen=True)
-class BenchImports:
-    """Time to import maps of other formats, their size, and how exactly they come back, on one core."""
-
-    sources: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SRC...")]
-    """Maps of any format that egoloc map import knows."""
-    repeats: Number = 5
-    """Timed imports of each, after one that warms up; the median counts."""
-    json: bool = False
-    """Print JSON."""
-
-    def run(self, _: tuple[str, ...]) -> None:
-        """Run the benchmark."""
-        from replay.bench import imports
-
-        _at_least_one(repeats=self.repeats, sources=len(self.sources))
-        _timed("imports", lambda: imports.run(self.sources, self.repeats), self.json)
-
-
-BENCHMARKS = {
-    "filter": BenchFilter,
-    "live": BenchLive,
-    "replay": BenchReplay,
-    "mcap": BenchMcap,
-    "maps": BenchMaps,
-    "imports": BenchImports,
-    "gates": BenchGates,
-    "faults": BenchFaults,
-    "hidden": BenchHidden,
-    "consistency": BenchConsistency,
-}
+        printed("consistency", work, consistency.table, self.json)
 
 
 def hidden_windows(begin: tuple[float, ...], end: tuple[float, ...]) -> list[tuple[float, float]]:
@@ -266,41 +210,3 @@ def hidden_windows(begin: tuple[float, ...], end: tuple[float, ...]) -> list[tup
         if not 0.0 <= first < last:
             raise EgolocError(f"--from, --to: expected 0 <= from < to, got {first:g} and {last:g}")
     return windows
-
-
-def _at_least_one(**options: int) -> None:
-    """Raise for an option, by its name, of which there are none."""
-    for name, value in options.items():
-        if value < 1:
-            raise EgolocError(f"--{name}: expected 1 or more, got {value}")
-
-
-def _above_zero(**options: tuple[float, ...]) -> None:
-    """Raise for an option, by its name, without numbers or with one that is no length of time."""
-    for name, values in options.items():
-        if not values or not all(0.0 < value < math.inf for value in values):
-            raise EgolocError(
-                f"--{name}: expected numbers above 0, got {', '.join(f'{v:g}' for v in values) or 'none'}"
-            )
-
-
-def _timed(name: str, work: Callable[[], Any], as_json: bool) -> None:
-    """A benchmark of speed."""
-    from replay.table import bench_table
-
-    _printed(name, lambda _: work(), bench_table, as_json)
-
-
-def _printed(
-    name: str, work: Callable[[Callable[[str], None]], Any], table: Callable[[Any], Any], as_json: bool
-) -> None:
-    """Run on one core, print the result as a table or as JSON. work: hears where it may tell what it is doing."""
-    from replay.bench.measure import one_core
-    from replay.table import output_console
-
-    with stage(f"benchmark {name}") as tell, one_core():
-        result = work(tell)
-    if as_json:
-        print_json(result)
-    else:
-        output_console().print(table(result))

@@ -11,7 +11,7 @@ from replay.commands.output import print_json, stage
 from sensors.errors import EgolocError
 
 if TYPE_CHECKING:  # records bring numpy along
-    from sensors.records import Log
+    from sensors.records import Frame, Log
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Convert:
     """Turn a recorded drive of another format into an MCAP log with ROS 2 messages."""
 
     format: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FORMAT")]
-    """rtklib, imu-gnss-drive, comma2k19, novatel, rosbag or gtsam-kitti."""
+    """rtklib, imu-gnss-drive, comma2k19, novatel, rosbag, gtsam-kitti or argoverse2."""
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SRC")]
     """The file or folder to read."""
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
@@ -35,7 +35,7 @@ class Convert:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Read, write, and say what was read."""
-        from sensors.datasets import load
+        from sensors.datasets import frames, load
 
         _check_new(self.log, overwrite=self.overwrite)
         if self.log.exists() and self.source.exists() and self.log.samefile(self.source):
@@ -46,7 +46,7 @@ class Convert:
                 from replay.harness import with_reference
 
                 log = with_reference(log, self.reference, log.map_frame)
-        _write((log,), self.log, "writing", as_json=self.json)
+        _write((log,), self.log, "writing", as_json=self.json, frames=frames(self.format, self.source))
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Simulate:
     """Write a simulated drive as an MCAP log."""
 
     scenario: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENARIO")]
-    """A scenario of the package (demo, clean, road-test, static) or a TOML file with one."""
+    """A scenario of the package (demo, clean, road-test, static, survey) or a TOML file with one."""
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]
     """The log to write; it must not exist yet."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: the scenario's)")] = None
@@ -67,6 +67,10 @@ class Simulate:
         None
     )
     """Length of the drive, km; with a duration as well, what ends first."""
+    frames: bool = False
+    """Put LiDAR frames into the log too, 10 a second; SCENARIO must have a [network] (survey has)."""
+    map: Annotated[Path | None, tyro.conf.arg(metavar="FILE.parquet", help_behavior_hint="(default: none)")] = None
+    """Write the vector map of the streets along the drive as well; SCENARIO must have a [network]."""
     overwrite: bool = False
     """Replace DEST.mcap."""
     json: bool = False
@@ -77,14 +81,23 @@ class Simulate:
         from replay.sources import LONGEST_KM, as_long_as
         from sensors.simulate.drive import simulate_pieces
         from sensors.simulate.scenarios import load
+        from sensors.simulate.surroundings import drive_frames, drive_map
 
-        _check_new(self.log, overwrite=self.overwrite)
+        for path in (self.log,) if self.map is None else (self.log, self.map):
+            _check_new(path, overwrite=self.overwrite)
+        if self.map is not None and self.map.resolve() == self.log.resolve():
+            raise EgolocError(f"--map: expected another file than the log, got {self.map}")
         if self.length_km is not None and not 0 < self.length_km <= LONGEST_KM:
             raise EgolocError(f"--length-km: expected more than 0 and at most {LONGEST_KM:g}, got {self.length_km:g}")
         scenario = as_long_as(load(self.scenario), self.length_km, self.duration_s)
         seed = scenario.seed if self.seed is None else self.seed
-        pieces = simulate_pieces(scenario.duration_s, seed, scenario)
-        _write(pieces, self.log, "simulating", as_json=self.json)
+        drive = scenario.duration_s, seed, scenario
+        seen = drive_frames(*drive) if self.frames else ()
+        if self.map is not None:
+            from sensors.maps.store import write_map
+
+            write_map(drive_map(*drive), self.map)
+        _write(simulate_pieces(*drive), self.log, "simulating", as_json=self.json, frames=seen)
 
 
 @dataclass(frozen=True)
@@ -112,15 +125,16 @@ class Info:
             print_inventory(found)
 
 
-def _write(pieces: "Iterable[Log]", path: Path, doing: str, *, as_json: bool) -> None:
-    """Write the pieces of a drive as they come, and say what it holds."""
+def _write(pieces: "Iterable[Log]", path: Path, doing: str, *, as_json: bool, frames: "Iterable[Frame]" = ()) -> None:
+    """Write the pieces and the frames of a drive as they come, and say what it holds."""
     from replay.inventory import Inventory, print_inventory
+    from replay.lidar_inventory import FrameCount
     from sensors.mcap.io import write_log
 
-    held = Inventory()
+    held, seen = Inventory(), FrameCount()
     with stage(f"{doing} {path}"):
-        write_log(path, held.watch(pieces))
-    found = held.found(str(path))
+        write_log(path, held.watch(pieces), frames=seen.watch(frames))
+    found = held.found(str(path)) | {"frames": seen.found()}
     if as_json:
         print_json(found)
     else:

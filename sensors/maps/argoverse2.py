@@ -96,7 +96,7 @@ def read(path: Path, frame: MapFrame | None = None) -> tuple[VectorMap, tuple[Le
         ring = ring_of_sides(_xyz(path, crossing.edge1, name), _xyz(path, crossing.edge2, name))
         builder.add(Kind.CROSSING, ring, name=name)
     _add_areas(path, archive.drivable_areas, builder)
-    own = _city_frame(path)
+    own = city_frame(path)
     found = builder.built(own or LOCAL, road_km=length_km)
     return _moved(path, _with_heights(path, found), own, frame), builder.left_out
 
@@ -110,8 +110,8 @@ def _file(path: Path) -> Path:
     return found[0]
 
 
-def _city_frame(path: Path) -> MapFrame | None:
-    """The frame in which city coordinates are map coordinates; the city is in the file's name."""
+def city_frame(path: Path) -> MapFrame | None:
+    """The frame in which city coordinates are map coordinates; the city is in a map file's name, else None."""
     named = re.search(r"____([A-Z]{3})_city_\d+", path.name)
     if not named or named[1] not in CITIES:
         return None

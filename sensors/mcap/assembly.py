@@ -5,7 +5,7 @@ What messages cannot say (vehicle, map frame) travels in a metadata record named
 
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
 
@@ -72,13 +72,25 @@ def damage(source: Container, gatherer: Gatherer, *, at_end: bool) -> list[LeftO
     return rows
 
 
+def sealed(content: msgspec.Struct) -> dict[str, str]:
+    """A metadata record: JSON with its checksum."""
+    text = msgspec.json.encode(content)
+    return {"json": text.decode(), "crc32": f"{zlib.crc32(text):08x}"}
+
+
+def unsealed(record: Mapping[str, str]) -> bytes | None:
+    """The JSON of a metadata record; None where it fails its checksum."""
+    text = record.get("json", "").encode()
+    return text if record.get("crc32", "") == f"{zlib.crc32(text):08x}" else None
+
+
 def read_facts(source: Container) -> tuple[Facts, tuple[LeftOut, ...]]:
     """Vehicle and map frame; the defaults where the log has none or they fail their checksum."""
     record = source.metadata.get(METADATA)
     if record is None:
         return Facts(), ()
-    text = record.get("json", "").encode()
-    if record.get("crc32", "") != f"{zlib.crc32(text):08x}":
+    text = unsealed(record)
+    if text is None:
         return Facts(), (LeftOut(source.path.name, f"metadata {METADATA} fails its checksum", 1),)
     try:
         return msgspec.json.decode(text, type=Facts), ()

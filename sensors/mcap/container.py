@@ -104,8 +104,8 @@ class Definitions:
 class ChunkEntry(NamedTuple):
     """What the summary says of a chunk: its record starts at start, next is where its message indexes end.
 
-    first_ns: the earliest log time in it; indexes: channel id -> where the message index of its messages lies (empty
-    where there are none).
+    first_ns, last_ns: the earliest and the latest log time in it; indexes: channel id -> where the message index of its
+    messages lies (empty where there are none).
     """
 
     start: int
@@ -113,6 +113,7 @@ class ChunkEntry(NamedTuple):
     first_ns: int
     compression: str
     indexes: Mapping[int, int]
+    last_ns: int
 
 
 @dataclass(frozen=True)
@@ -187,13 +188,13 @@ def _summary(data: memoryview, at: int) -> Summary:
 
 
 def _chunk_entry(record: Parser) -> ChunkEntry:
-    first_ns, _, start, length = (record.integer(8) for _ in range(4))
+    first_ns, last_ns, start, length = (record.integer(8) for _ in range(4))
     pairs = np.frombuffer(record.raw(record.integer(4)), np.uint8)
     if len(pairs) % _INDEX_PAIR.itemsize:
         raise DamagedError("a field passes the end of its record")
     indexes = {int(channel): int(place) for channel, place in pairs.view(_INDEX_PAIR).tolist()}
     index_length, compression = record.integer(8), record.text()
-    return ChunkEntry(start, start + length + index_length, first_ns, compression, indexes)
+    return ChunkEntry(start, start + length + index_length, first_ns, compression, indexes, last_ns)
 
 
 def indexed_times(data: memoryview, at: int, channel: int) -> NDArray[np.int64]:

@@ -1,21 +1,19 @@
 """Logs to and from MCAP files with ROS 2 messages: read_pieces, read_log, write_log, describe."""
 
 import os
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-import msgspec
-
 from sensors.errors import EgolocError
-from sensors.mcap.assembly import METADATA, Facts
+from sensors.mcap.assembly import METADATA, Facts, sealed
 from sensors.mcap.encode import messages_of
+from sensors.mcap.frame_writer import FrameWriter
 from sensors.mcap.reader import LogReader
 from sensors.mcap.summary import LogSummary, TopicSummary, describe
 from sensors.mcap.writer import ChunkWriter, Compression
 from sensors.pieces import PIECE_S, join
-from sensors.records import Log
+from sensors.records import Frame, Log
 
 __all__ = ["LogSummary", "TopicSummary", "describe", "read_log", "read_pieces", "write_log"]
 
@@ -52,11 +50,19 @@ def read_pieces(
     return LogReader(path, topics, length_s).pieces()
 
 
-def write_log(path: str | os.PathLike[str], log: Log | Iterable[Log], compression: Compression = "zstd") -> None:
+def write_log(
+    path: str | os.PathLike[str],
+    log: Log | Iterable[Log],
+    compression: Compression = "zstd",
+    frames: Iterable[Frame] = (),
+) -> None:
     """Write a log, or its pieces as they come, as MCAP, whole or not at all.
 
     arrival_ns becomes the log time, t_ns the header stamp. Messages are in order of log time as long as none arrives
     before the first of the piece before its own; then the file does not depend on how the log is cut.
+
+    frames: in order of time; one is held at a time. Each sweep is a chunk of its own that stands before the first chunk
+    of other messages that starts after its arrival (``sensors.mcap.frame_writer`` says which topics hold it).
     """
     if compression not in {"zstd", "lz4", "none"}:
         raise EgolocError(f"compression: expected zstd, lz4 or none, got {compression!r}")
@@ -67,7 +73,7 @@ def write_log(path: str | os.PathLike[str], log: Log | Iterable[Log], compressio
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as stream:
-            _write(ChunkWriter(stream, compression), first, pieces, target)
+            _write(ChunkWriter(stream, compression), first, pieces, target, frames)
         partial.replace(target)
     except OSError as error:
         raise EgolocError(f"{target}: cannot be written: {error.strerror or error}") from None
@@ -76,9 +82,10 @@ def write_log(path: str | os.PathLike[str], log: Log | Iterable[Log], compressio
             partial.unlink(missing_ok=True)
 
 
-def _write(writer: ChunkWriter, first: Log, rest: Iterator[Log], target: Path) -> None:
-    text = msgspec.json.encode(Facts(first.vehicle, first.map_frame))
-    writer.metadata(METADATA, {"json": text.decode(), "crc32": f"{zlib.crc32(text):08x}"})
+def _write(writer: ChunkWriter, first: Log, rest: Iterator[Log], target: Path, frames: Iterable[Frame]) -> None:
+    writer.metadata(METADATA, sealed(Facts(first.vehicle, first.map_frame)))
+    waiting_frames = FrameWriter(writer, frames)
+    writer.before_chunk = waiting_frames.write_until
     waiting = messages_of(first)
     for piece in rest:
         if (piece.vehicle, piece.map_frame) != (first.vehicle, first.map_frame):
@@ -88,4 +95,5 @@ def _write(writer: ChunkWriter, first: Log, rest: Iterator[Log], target: Path) -
             writer.messages(waiting, before=min(int(topic.log_time.min()) for topic in following))
             waiting = following
     writer.messages(waiting)
+    waiting_frames.write_until(None)
     writer.finish()

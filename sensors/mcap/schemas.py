@@ -29,6 +29,32 @@ geometry_msgs/Vector3 angular_velocity
 float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
 float64[9] linear_acceleration_covariance""",
+    "sensor_msgs/PointField": """uint8 INT8=1
+uint8 UINT8=2
+uint8 INT16=3
+uint8 UINT16=4
+uint8 INT32=5
+uint8 UINT32=6
+uint8 FLOAT32=7
+uint8 FLOAT64=8
+string name
+uint32 offset
+uint8 datatype
+uint32 count""",
+    "sensor_msgs/PointCloud2": """std_msgs/Header header
+uint32 height
+uint32 width
+PointField[] fields
+bool is_bigendian
+uint32 point_step
+uint32 row_step
+uint8[] data
+bool is_dense""",
+    "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation",
+    "geometry_msgs/TransformStamped": """std_msgs/Header header
+string child_frame_id
+Transform transform""",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
     "egoloc_msgs/PoseModes": "std_msgs/Header header\nfloat64[6] modes\nfloat64[2] weights",
     "gps_msgs/GPSStatus": """std_msgs/Header header
 uint16 satellites_used
@@ -100,7 +126,7 @@ def schema_text(name: str) -> str:
     for current in order:
         package = current.split("/")[0]
         for line in _DEFINITIONS[current].splitlines():
-            kind = line.split()[0]
+            kind = line.split()[0].partition("[")[0]
             inner = kind if "/" in kind else f"{package}/{kind}"
             if inner in _DEFINITIONS and inner not in order:
                 order.append(inner)

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 from sensors.clock import NS_PER_S
 from sensors.geodesy import MapFrame
 from sensors.mcap.assembly import METADATA, Facts
+from sensors.mcap.cdr import short_name
 from sensors.mcap.columns import Topic
 from sensors.mcap.decoded import stamps
+from sensors.mcap.point_cloud import POINT_CLOUD
 from sensors.mcap.reader import LogReader
-from sensors.mcap.topics import Roles, conflict
+from sensors.mcap.static_tf import TRANSFORMS
+from sensors.mcap.topics import LIDAR, Roles, conflict
 from sensors.pieces import PIECE_S, summed
 from sensors.records import LeftOut, Log
 from sensors.steps import Steps
@@ -111,6 +114,8 @@ def _is_stamped(topic: Topic) -> bool:
 
 def _topic(topic: Topic, reader: LogReader, steps: Steps) -> TopicSummary:
     fed = tuple(s for s, source in reader.roles.sensors.items() if source is topic and reader.rows[s])
+    if topic.count and short_name(topic.schema.name) in {POINT_CLOUD, TRANSFORMS}:
+        fed = (LIDAR,)  # read as frames, not as columns
     return TopicSummary(
         name=topic.name,
         schema=topic.schema.name,

@@ -1,8 +1,9 @@
 """Writes messages as an MCAP file, chunk by chunk: a chunk is serialized by column, never message by message."""
 
+import struct
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import IO, Literal, NamedTuple
 
 import lz4.frame
@@ -48,7 +49,10 @@ class _Held(NamedTuple):
 
 
 class ChunkWriter:
-    """An MCAP file being written; finish() adds the summary."""
+    """An MCAP file being written; finish() adds the summary.
+
+    before_chunk: called with a chunk's first log time before the chunk is written.
+    """
 
     def __init__(self, stream: IO[bytes], compression: Compression) -> None:
         self.stream, self.compression = stream, compression
@@ -61,6 +65,7 @@ class ChunkWriter:
         self._counts: Counter[int] = Counter()
         self._span: tuple[int, int] | None = None
         self._held: list[_Held] = []
+        self.before_chunk: Callable[[int], None] | None = None
         self._write(container.MAGIC)
         self._record(records.Header("ros2", "egoloc"))
 
@@ -77,7 +82,7 @@ class ChunkWriter:
         rest is held back. The file does not depend on how the messages were divided.
         """
         for topic in topics:
-            channel = self._channel(topic)
+            channel = self._channel(topic.topic, topic.schema)
             self._held.append(_Held(channel, topic.rows(), np.arange(len(topic.log_time)), topic.log_time))
         self._held.sort(key=lambda held: held.channel)
         which, place, log_time = _merged(self._held)
@@ -93,13 +98,23 @@ class ChunkWriter:
             first = min(stop, len(which))
         self._hold(which[first:], place[first:])
 
-    def _channel(self, topic: Messages) -> int:
+    def message(self, topic: str, schema: str, data: bytes, log_time: int) -> None:
+        """Write one message in a chunk of its own, which those who do not want it can pass over."""
+        channel = self._channel(topic, schema)
+        before = self._define([channel])
+        (sequence,) = self._number(np.array([channel])).tolist()
+        content = struct.pack("<HIQQ", channel, sequence, log_time, log_time) + data
+        record = struct.pack("<BQ", Opcode.MESSAGE, len(content)) + content
+        index = _message_index(channel, np.array([log_time]), np.array([len(before)]))
+        self._write_chunk(before + record, log_time, log_time, {channel: index})
+
+    def _channel(self, topic: str, schema: str) -> int:
         """The channel of a topic."""
-        if topic.topic not in self._channels:
-            known = TOPICS.index(topic.topic) + 1 if topic.topic in TOPICS else len(TOPICS) + len(self._channels) + 1
-            self._channels[topic.topic] = known
-            self.schemas[topic.topic] = topic.schema
-        return self._channels[topic.topic]
+        if topic not in self._channels:
+            known = TOPICS.index(topic) + 1 if topic in TOPICS else len(TOPICS) + len(self._channels) + 1
+            self._channels[topic] = known
+            self.schemas[topic] = schema
+        return self._channels[topic]
 
     def _hold(self, which: Ints, place: Ints) -> None:
         """Keep back these messages, and no others."""
@@ -111,6 +126,8 @@ class ChunkWriter:
 
     def _chunk(self, which: Ints, place: Ints, log_time: Ints) -> None:
         """Write one chunk (definitions of channels that it is the first to hold, messages) and its message indexes."""
+        if self.before_chunk is not None:
+            self.before_chunk(int(log_time[0]))
         channels = np.array([held.channel for held in self._held])[which]
         before = self._define(np.unique(channels).tolist())
         sizes = np.array([held.size for held in self._held], np.int64)[which]

@@ -21,6 +21,7 @@ from sensors.simulate.following import TrajectoryPlan
 from sensors.simulate.gnss import GnssSensor
 from sensors.simulate.gnss_config import GnssSimulation
 from sensors.simulate.imu import ImuBiases, ImuSensor, ImuSimulation
+from sensors.simulate.lidar_config import LidarSimulation
 from sensors.simulate.network import NetworkPlan
 from sensors.simulate.noise import Nanoseconds, rows_between, stream
 from sensors.simulate.planning import PlannedDrive, plan_drive
@@ -75,6 +76,7 @@ class DriveConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     gnss: GnssSimulation = GnssSimulation()
     pose_fix: PoseFixSimulation = PoseFixSimulation()
     wheel: WheelSimulation = WheelSimulation()
+    lidar: LidarSimulation = LidarSimulation()
     reference: ReferenceSimulation = ReferenceSimulation()
 
     def __post_init__(self) -> None:
@@ -183,7 +185,7 @@ class _Sensors:
         self._truth, self._duration_s, self._config = truth, duration_s, config
         spec, _ = config.imu.part(config.vehicle.imu)
         vehicle = msgspec.structs.replace(config.vehicle, imu=spec)
-        self._frame = _map_frame(truth, config.map_frame)
+        self._frame = map_frame(truth, config.map_frame)
         scene, mode, night = drive_tags(course, truth.start_ns, duration_s, config.scenes, seed)
         self._tags = {"scene": scene, "mode": mode} if config.environments else {}
         self._imu = ImuSensor(truth, course, duration_s, spec, config.imu, stream(seed, "imu"))
@@ -226,7 +228,8 @@ def _window(start_ns: int, begin_s: float, end_s: float) -> NDArray[np.int64]:
     return window
 
 
-def _map_frame(truth: Truth, kind: Literal["utm", "enu"]) -> MapFrame:
+def map_frame(truth: Truth, kind: Literal["utm", "enu"]) -> MapFrame:
+    """Map axes of a drive: those of its first place."""
     llh = truth.at(np.array([truth.start_ns])).llh[0]
     if kind == "enu":
         return MapFrame("enu", (float(np.degrees(llh[0])), float(np.degrees(llh[1])), float(llh[2])))

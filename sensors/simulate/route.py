@@ -41,18 +41,27 @@ class Route:
 
     def place(self, s: Floats, heading: float = 0.0) -> Floats:
         """(N, 2) m from the start to s (N,) in the plane; heading: rad at the start, ccw from the first axis."""
-        lengths = np.diff(self.edges)
-        turned = self.curvature * lengths
-        begins = heading + np.concatenate(([0.0], np.cumsum(turned)[:-1]))
-        corners = np.zeros((len(lengths), 2))
-        corners[1:] = np.cumsum(_chord(lengths, turned, begins), axis=0)[:-1]
-        at = self.element(s)
-        into = s - self.edges[at]
-        return corners[at] + _chord(into, self.curvature[at] * into, begins[at])
+        return place_along(self.edges, self.curvature, s, heading)
 
     def element(self, s: Floats) -> NDArray[np.intp]:
         """(N,) index of the element at s."""
-        return np.clip(np.searchsorted(self.edges, s, side="right") - 1, 0, len(self.curvature) - 1)
+        return _element(self.edges, s)
+
+
+def place_along(edges: Floats, curvature: Floats, s: Floats, heading: float) -> Floats:
+    """(N, 2) m from the start of straights and arcs to s (N,); edges: (M + 1,) m, curvature: (M,) 1/m, heading: rad."""
+    lengths = np.diff(edges)
+    turned = curvature * lengths
+    begins = heading + np.concatenate(([0.0], np.cumsum(turned)[:-1]))
+    corners = np.zeros((len(lengths), 2))
+    corners[1:] = np.cumsum(_chord(lengths, turned, begins), axis=0)[:-1]
+    at = _element(edges, s)
+    into = s - edges[at]
+    return corners[at] + _chord(into, curvature[at] * into, begins[at])
+
+
+def _element(edges: Floats, s: Floats) -> NDArray[np.intp]:
+    return np.clip(np.searchsorted(edges, s, side="right") - 1, 0, len(edges) - 2)
 
 
 def _chord(length: Floats, turned: Floats, begin: Floats) -> Floats:

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from replay.cli import COMMANDS, main
-from replay.commands.benching import BENCHMARKS
+from replay.commands.benchmarks import BENCHMARKS
 from replay.store import file_hash
 from sensors.mcap.io import write_log
 from sensors.records import Log

@@ -3,7 +3,8 @@
 import numpy as np
 
 from sensors.maps.vector_map import Kind, VectorMap
-from sensors.simulate.city_map import HALF_WIDTH_M, city_map
+from sensors.simulate.city_map import city_map
+from sensors.simulate.furnishing import HALF_WIDTH_M, LANE_M
 
 
 def columns(city: VectorMap) -> list[np.ndarray]:
@@ -34,10 +35,11 @@ def test_what_it_holds() -> None:
     assert ((city.surfels.ratios > 0.0) & (city.surfels.ratios <= 0.1)).all()
 
 
-def test_curbs_run_beside_the_middle_of_the_street() -> None:
+def test_curbs_run_beside_the_lane_in_the_middle_of_the_street() -> None:
     elements = city_map(2.0, 1).elements
     lines = [elements.vertices(row) for row in np.flatnonzero(elements.kind <= Kind.ROAD_BOUNDARY)]
     streets = len(lines) // 5
-    for middle, curb in zip(lines[:streets], lines[3 * streets : 4 * streets], strict=True):
-        apart = np.linalg.norm((curb - middle)[:, :2], axis=1)
-        np.testing.assert_allclose(apart, HALF_WIDTH_M, atol=0.1)
+    yellow, _, white, left, right = (lines[k * streets : (k + 1) * streets] for k in range(5))
+    for line, curb, width in ((yellow, left, HALF_WIDTH_M - LANE_M / 2), (white, yellow, LANE_M), (left, right, 14.0)):
+        for a, b in zip(line, curb, strict=True):
+            np.testing.assert_allclose(np.linalg.norm((a - b)[:, :2], axis=1), width, atol=0.1)

@@ -1,0 +1,27 @@
+"""egoloc bench: all benchmarks by name."""
+
+from replay.commands.bench_maps import BenchImports, BenchLidar, BenchMaps
+from replay.commands.benching import (
+    BenchConsistency,
+    BenchFaults,
+    BenchFilter,
+    BenchGates,
+    BenchHidden,
+    BenchLive,
+    BenchMcap,
+    BenchReplay,
+)
+
+BENCHMARKS = {
+    "filter": BenchFilter,
+    "live": BenchLive,
+    "replay": BenchReplay,
+    "mcap": BenchMcap,
+    "maps": BenchMaps,
+    "imports": BenchImports,
+    "lidar": BenchLidar,
+    "gates": BenchGates,
+    "faults": BenchFaults,
+    "hidden": BenchHidden,
+    "consistency": BenchConsistency,
+}
