@@ -76,6 +76,8 @@ class MatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Polylines are cut into pieces of at most this length, m."""
     most_elements: int = 512
     """The nearest so many pieces, points and surfels are used."""
+    surfel_share: float = 0.5
+    """Of them, what surfels may take where segments and points could fill it, 0..1."""
     sampled: Literal["ends", "middle"] = "ends"
     """Where a segment is compared with the BEV: the mean over both its ends, or its middle."""
 

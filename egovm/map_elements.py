@@ -47,7 +47,7 @@ class Pieces:
 def pieces_around(
     elements: Elements, surfels: Surfels, T_map_body: Floats, config: NetworkConfig, ground_m: float
 ) -> Pieces:
-    """The pieces near an initial pose (4, 4), as many as the network takes, nearest first by their middles.
+    """The pieces near an initial pose (4, 4), nearest first by their middles, as many as the network takes.
 
     elements, surfels: what ``MapFile.around`` gives; ground_m: height of the ground under the vehicle in body axes, m.
     Segments are cut off, points and surfels dropped, where a candidate pose would see them beyond the BEV
@@ -61,7 +61,7 @@ def pieces_around(
     if config.ablation.surfels:
         parts.append(_surfels(surfels, T_map_body, height_m, half))
     columns = (np.concatenate(each) for each in zip(*(_columns(part) for part in parts), strict=True))
-    return _nearest(Pieces(*columns), config.matching.most_elements)
+    return _nearest(Pieces(*columns), config.matching)
 
 
 def usable_half_m(config: NetworkConfig) -> float:
@@ -208,10 +208,16 @@ def _twice(xy: Floats) -> Floats:
     return np.repeat(xy[:, None], 2, axis=1)
 
 
-def _nearest(pieces: Pieces, most: int) -> Pieces:
+def _nearest(pieces: Pieces, config: MatchingConfig) -> Pieces:
+    """Nearest first; surfels, a hundred times as many, take no more than their share from the others."""
     middle = pieces.ends[..., :2].mean(axis=1)
-    order = np.argsort(np.hypot(*middle.T), kind="stable")[:most]
-    left_out = len(pieces) - len(order)
+    order = np.argsort(np.hypot(*middle.T), kind="stable")
+    surfel = pieces.type[order] == SURFEL
+    share = min(int(surfel.sum()), round(config.surfel_share * config.most_elements))
+    others = min(int((~surfel).sum()), config.most_elements - share)
+    allowed = np.where(surfel, np.cumsum(surfel) <= config.most_elements - others, np.cumsum(~surfel) <= others)
+    left_out = len(pieces) - int(allowed.sum())
     if left_out:
+        most = config.most_elements
         log.info("%d of %d pieces of map left out: most_elements is %d", left_out, len(pieces), most)
-    return Pieces(*(column[order] for column in _columns(pieces)), left_out)
+    return Pieces(*(column[order[allowed]] for column in _columns(pieces)), left_out)

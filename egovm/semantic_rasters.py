@@ -36,8 +36,7 @@ def semantic_rasters(
     lines = on_plane(lines[..., :2], T_map_body, height_m)
     points = np.repeat(on_plane(place[:, None, :2], T_map_body, height_m), 2, axis=1)
     return tuple(
-        _raster(bev, level, (lines, line_kind, 0.5), (points, point_kind, 0.5**0.5))
-        for level in range(len(bev.cell_m))
+        _raster(bev, level, (lines, line_kind, 0.5), (points, point_kind, 0.5**0.5)) for level in range(len(bev.cell_m))
     )
 
 
