@@ -44,17 +44,20 @@ class LatticeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def step_m(self, level: int) -> float:
         """Distance of neighbours at a level, which is the BEV cell there, m."""
-        return self.half_m / 2**level / self.reach
+        return self.half_m / 2.0**level / self.reach
 
     def step_rad(self, level: int) -> float:
         """The same of the yaw, rad."""
-        return math.radians(self.half_deg) / 2**level / self.reach
+        return math.radians(self.half_deg) / 2.0**level / self.reach
 
     def check_cells(self, cell_m: tuple[float, ...]) -> None:
         """Raise where BEV maps with these cells do not fit: their cells are the steps of the levels."""
         steps = tuple(self.step_m(level) for level in range(self.levels))
         if len(cell_m) != self.levels or any(abs(a - b) > 1e-9 for a, b in zip(cell_m, steps, strict=True)):
             raise EgolocError(f"lattice: expected BEV cells of {steps} m, the steps of the levels, got {cell_m}")
+
+
+PAPER = LatticeConfig()
 
 
 def yaws(config: LatticeConfig, level: int, like: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from egovm.lattice import LatticeConfig, candidates, compose, seen_from
+from egovm.lattice import PAPER, LatticeConfig, candidates, compose, seen_from
 from egovm.solver_modes import two_modes
 from egovm.solver_window import Window, dot_window, dots_at, lattice_dots, summed_lattice_dots
 
@@ -26,8 +26,8 @@ class LevelEstimate:
     """What one level says, about its centre.
 
     scores: (B, yaw, x, y) of the candidates, as ``lattice.candidates`` orders them; log_p: the same normalized, -inf
-    where a prior excludes; mean: (B, 3) x m, y m, yaw rad; cov: (B, 3, 3) in (m, m, rad); landmarks: (B,) int64 elements
-    used. Without one the histogram is flat, the mean 0 and the covariance infinite on its diagonal.
+    where a prior excludes; mean: (B, 3) x m, y m, yaw rad; cov: (B, 3, 3) in (m, m, rad); landmarks: (B,) int64,
+    elements used. Without one the histogram is flat, the mean 0 and the covariance infinite on its diagonal.
     centre: (B, 3) detached offset of the level's centre from the initial pose. contribution: (B, K) detached, what the
     score at the mean would lose without the element, the factor exp(tau) / K^alpha left as it is; they add up to it.
     """
@@ -76,11 +76,11 @@ class Similarity(nn.Module):
 class PoseSolver(nn.Module):
     """Estimates a pose offset from BEV features and map embeddings of each level."""
 
-    def __init__(
-        self, lattice: LatticeConfig = LatticeConfig(), alpha: float = 1.0, groups: int = 1, hidden: int = 16
-    ) -> None:
-        """alpha: the score is the sum over K elements by K^alpha, the paper's mean is 1; groups of channels, by which the
-        channels of every level are divisible; hidden: width of h where there is more than one."""
+    def __init__(self, lattice: LatticeConfig = PAPER, alpha: float = 1.0, groups: int = 1, hidden: int = 16) -> None:
+        """alpha: the score is the sum over K elements by K^alpha, the paper's mean is 1.
+
+        groups: of channels, by which those of every level are divisible; hidden: width of h where there are several.
+        """
         super().__init__()
         self.lattice, self.alpha, self.groups = lattice, alpha, groups
         self.tau = nn.Parameter(torch.zeros(lattice.levels))
@@ -124,7 +124,7 @@ class PoseSolver(nn.Module):
         centre: Tensor,
         search: Tensor | None = None,
     ) -> LevelEstimate:
-        """One level about a centre (B, 3), an offset from the initial pose; places (B, K, P, 2) about the initial pose."""
+        """One level about a centre (B, 3), an offset from the initial pose, as places (B, K, P, 2) and search are."""
         kind = _precise(features)
         with torch.autocast(features.device.type, enabled=False):
             around = seen_from(centre.to(kind)[:, None, None], places.to(kind))

@@ -35,7 +35,7 @@ def gathered_dots(
         _dots_of(_gathered(features, corners[:, s], size, embeddings.dtype), embeddings[:, s], groups)
         for s in _chunks(corners.shape[1])
     ]
-    dots = torch.cat(parts, 1).unflatten(-1, (size, size))
+    dots = torch.unflatten(torch.cat(parts, 1), -1, (size, size))
     return torch.where(valid[:, :, None, None, None], dots, torch.zeros((), dtype=dots.dtype, device=dots.device))
 
 
@@ -108,7 +108,7 @@ def _arrays(*tensors: Tensor) -> list[object]:
 
 def _split(channels: Tensor, groups: int) -> Tensor:
     """(..., G, C / G) of (..., C)."""
-    return channels.unflatten(-1, (groups, -1))
+    return torch.unflatten(channels, -1, (groups, channels.shape[-1] // groups))
 
 
 def _chunks(points: int) -> list[slice]:

@@ -1,4 +1,4 @@
-"""The two strongest modes of a histogram over poses: what a matcher that may have locked onto a look-alike tells of it."""
+"""The two strongest modes of a histogram over poses: how a matcher tells that a look-alike is possible, too."""
 
 import torch
 from torch import Tensor

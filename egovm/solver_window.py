@@ -68,7 +68,8 @@ def dot_window(
         size,
         groups,
     )
-    return Window(lattice, level, (height, width), dots.unflatten(1, (-1, points)), places, corners, used)
+    dots = torch.unflatten(dots, 1, places.shape[1:3])
+    return Window(lattice, level, (height, width), dots, places, corners, used)
 
 
 def window_cells(lattice: LatticeConfig, height: int, width: int) -> int:
@@ -79,17 +80,17 @@ def window_cells(lattice: LatticeConfig, height: int, width: int) -> int:
     """
     half = (max(height, width) - 1) / 2 - lattice.reach
     moved = math.ceil(1.001 * max(half, 0.0) * 2.0 * math.radians(lattice.half_deg))
-    level_0 = lattice.steps + 1 + moved
-    if min(height, width) < level_0:
-        raise EgolocError(f"BEV map: expected at least {level_0} x {level_0} cells, got {height} x {width}")
-    return level_0
+    size = lattice.steps + 1 + moved
+    if min(height, width) < size:
+        raise EgolocError(f"BEV map: expected at least {size} x {size} cells, got {height} x {width}")
+    return size
 
 
 def lattice_dots(window: Window) -> Tensor:
     """Dots (B, K, G, yaw, x, y) of each element at every candidate: the mean over its points."""
     patches, weights = _read(window)
     below, steps = window.lattice.steps, window.lattice.steps + 1
-    patches = patches.unflatten(-1, (steps, steps))
+    patches = torch.unflatten(patches, -1, (steps, steps))
     blended = sum(
         weights[..., corner, None, None] * patches[..., i : i + below, j : j + below]
         for corner, (i, j) in enumerate(_CORNERS)
@@ -104,7 +105,7 @@ def summed_lattice_dots(window: Window) -> Tensor:
     below, steps = window.lattice.steps, window.lattice.steps + 1
     patches = patches.sum(3).flatten(1, 2).transpose(1, 2)
     weights = weights[:, :, :, 0].flatten(1, 2).permute(0, 2, 3, 1) / window.places.shape[2]
-    shared = (weights @ patches).unflatten(-1, (steps, steps))
+    shared = torch.unflatten(weights @ patches, -1, (steps, steps))
     blended = sum(shared[:, :, corner, i : i + below, j : j + below] for corner, (i, j) in enumerate(_CORNERS))
     assert isinstance(blended, Tensor)
     return blended.flip(-2, -1)
@@ -127,7 +128,8 @@ def dots_at(window: Window, offsets: Tensor) -> Tensor:
     samples, poses, elements, points, _ = index.shape
     groups = window.dots.shape[3]
     index = index.permute(0, 2, 3, 1, 4).reshape(samples, elements, points, 1, poses * 4)
-    read = window.dots.flatten(4).gather(4, index.expand(-1, -1, -1, groups, -1)).unflatten(-1, (poses, 4))
+    read = window.dots.flatten(4).gather(4, index.expand(-1, -1, -1, groups, -1))
+    read = torch.unflatten(read, -1, (poses, 4))
     return (read * weights.permute(0, 2, 3, 1, 4)[:, :, :, None]).sum(-1).mean(2).permute(0, 3, 1, 2)
 
 
@@ -183,7 +185,6 @@ def _read(window: Window) -> tuple[Tensor, Tensor]:
     steps = torch.arange(window.lattice.steps + 1, device=base.device)
     row, column = base.to(torch.int64).unbind(-1)
     index = (row[..., None, None] + steps[:, None]) * size + column[..., None, None] + steps
-    samples, elements, points, groups = window.dots.shape[:4]
-    flat = index.flatten(3)[:, :, :, None].expand(-1, -1, -1, groups, -1)
-    patches = window.dots.flatten(4).gather(4, flat).unflatten(-1, (len(around), -1))
-    return patches, weights[:, :, :, None]
+    flat = index.flatten(3)[:, :, :, None].expand(-1, -1, -1, window.dots.shape[3], -1)
+    patches = window.dots.flatten(4).gather(4, flat)
+    return torch.unflatten(patches, -1, (len(around), len(steps) ** 2)), weights[:, :, :, None]
