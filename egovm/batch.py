@@ -60,8 +60,8 @@ class MapElements(Moved):
     """K pieces of map of each frame, in body axes at the initial pose.
 
     type: (B, K) int64 Kind or SURFEL; ends: (B, K, 2, 3) m, both ends of a segment on the BEV plane (Eq. S1-S4), twice
-    the same place for points and surfels, z as far above the plane (0 for segments); height: (B, K) m of poles and signs, 0 else;
-    normal: (B, K, 3) and ratios: (B, K, 2) of surfels, 0 else; valid: (B, K) bool.
+    the same place for points and surfels, z as far above the plane (0 for segments); height: (B, K) m of poles and
+    signs, 0 else; normal: (B, K, 3) and ratios: (B, K, 2) of surfels, 0 else; valid: (B, K) bool.
     """
 
     type: Tensor
@@ -86,8 +86,7 @@ class Truth(Moved):
     """What training compares with.
 
     offset: (B, 3) x m, y m, yaw rad of the true pose in the initial one (T_init^-1 T_true); semantic: of each level
-    (B, TYPES - 1, H, W) bool, what is painted or stands there; surfels have no raster. Rows of all BEV maps rise with x,
-    columns with y; the vehicle is in the middle.
+    (B, TYPES - 1, H, W) bool, what is painted or stands there; surfels have no raster.
     """
 
     offset: Tensor

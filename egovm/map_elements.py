@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ log = logging.getLogger(__name__)
 
 _SHORTEST_M = 0.05
 """Shorter rests of segments that the edge of the BEV cuts off are dropped, m."""
+_COLUMNS = ("type", "ends", "height", "normal", "ratios")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +45,11 @@ class Pieces:
     def __len__(self) -> int:
         return len(self.type)
 
+    def chosen(self, rows: NDArray[Any], left_out: int = 0) -> Self:
+        """The pieces of these rows (indices or a mask)."""
+        columns = self.type[rows], self.ends[rows], self.height[rows], self.normal[rows], self.ratios[rows]
+        return type(self)(*columns, left_out)
+
 
 def pieces_around(
     elements: Elements, surfels: Surfels, T_map_body: Floats, config: NetworkConfig, ground_m: float
@@ -60,8 +67,7 @@ def pieces_around(
     ]
     if config.ablation.surfels:
         parts.append(_surfels(surfels, T_map_body, height_m, half))
-    columns = (np.concatenate(each) for each in zip(*(_columns(part) for part in parts), strict=True))
-    return _nearest(Pieces(*columns), config.matching)
+    return _nearest(_joined(parts), config.matching)
 
 
 def usable_half_m(config: NetworkConfig) -> float:
@@ -78,19 +84,13 @@ def usable_half_m(config: NetworkConfig) -> float:
 
 
 def padded(frames: Sequence[Pieces], count: int | None = None) -> MapElements:
-    """Pieces of B frames side by side, with a mask; count: K, None: as many as the longest has, 1 at least."""
-    longest = max((len(frame) for frame in frames), default=0)
+    """Pieces of B frames (one or more) side by side, with a mask. count: K; None: of the longest frame, 1 at least."""
+    longest = max(len(frame) for frame in frames)
     if count is not None and count < longest:
         raise ValueError(f"padded: expected at most {count} pieces in a frame, got {longest}")
     rows = max(longest, 1) if count is None else count
-    filled = [
-        torch.from_numpy(
-            np.stack([np.pad(column, [(0, rows - len(column))] + [(0, 0)] * (column.ndim - 1)) for column in each])
-        )
-        for each in zip(*(_columns(frame) for frame in frames), strict=True)
-    ]
     valid = torch.arange(rows) < torch.tensor([len(frame) for frame in frames])[:, None]
-    return MapElements(*filled, valid)
+    return MapElements(**{name: _stacked(frames, name, rows) for name in _COLUMNS}, valid=valid)
 
 
 def places_of(elements: MapElements, config: MatchingConfig) -> Tensor:
@@ -99,12 +99,27 @@ def places_of(elements: MapElements, config: MatchingConfig) -> Tensor:
     return ends if config.sampled == "ends" else ends.mean(2, keepdim=True)
 
 
-def _columns(pieces: Pieces) -> tuple[NDArray[np.float32] | NDArray[np.int64], ...]:
-    return pieces.type, pieces.ends, pieces.height, pieces.normal, pieces.ratios
+def _stacked(frames: Sequence[Pieces], name: str, rows: int) -> Tensor:
+    """(B, rows, ...) a column of all frames, 0 below its end."""
+    columns = [getattr(frame, name) for frame in frames]
+    stacked = np.zeros((len(frames), rows, *columns[0].shape[1:]), columns[0].dtype)
+    for row, column in zip(stacked, columns, strict=True):
+        row[: len(column)] = column
+    return torch.from_numpy(stacked)
+
+
+def _joined(parts: Sequence[Pieces]) -> Pieces:
+    return Pieces(
+        np.concatenate([part.type for part in parts]),
+        np.concatenate([part.ends for part in parts]),
+        np.concatenate([part.height for part in parts]),
+        np.concatenate([part.normal for part in parts]),
+        np.concatenate([part.ratios for part in parts]),
+    )
 
 
 def _made(
-    type_: NDArray[np.integer] | Floats,
+    type_: NDArray[np.integer],
     ends: Floats,
     z: Floats | None = None,
     height: Floats | None = None,
@@ -115,11 +130,13 @@ def _made(
     count = len(ends)
     z = np.zeros(count) if z is None else z
     filled = np.concatenate((ends, np.broadcast_to(z[:, None, None], (count, 2, 1))), axis=2)
-    rest = [
-        np.zeros(shape, np.float32) if given is None else given.astype(np.float32)
-        for given, shape in ((height, count), (normal, (count, 3)), (ratios, (count, 2)))
-    ]
-    return Pieces(type_.astype(np.int64), filled.astype(np.float32), *rest)
+    return Pieces(
+        type_.astype(np.int64),
+        filled.astype(np.float32),
+        np.zeros(count, np.float32) if height is None else height.astype(np.float32),
+        np.zeros((count, 3), np.float32) if normal is None else normal.astype(np.float32),
+        np.zeros((count, 2), np.float32) if ratios is None else ratios.astype(np.float32),
+    )
 
 
 def _segments(elements: Elements, T_map_body: Floats, config: MatchingConfig, height_m: float, half_m: float) -> Pieces:
@@ -220,4 +237,4 @@ def _nearest(pieces: Pieces, config: MatchingConfig) -> Pieces:
     if left_out:
         most = config.most_elements
         log.info("%d of %d pieces of map left out: most_elements is %d", left_out, len(pieces), most)
-    return Pieces(*(column[order[allowed]] for column in _columns(pieces)), left_out)
+    return pieces.chosen(order[allowed], left_out)

@@ -18,13 +18,14 @@ class SemanticEmbeddings(nn.Module):
         super().__init__()
         self.learned = nn.Parameter(torch.randn(TYPES, channels) * channels**-0.5) if learned else None
         self.encoder = None if learned else _mlp(TYPES, channels)
+        self.register_buffer("one_hot", torch.eye(TYPES), persistent=False)
 
     def forward(self) -> Tensor:
         """(TYPES, C)."""
         if self.learned is not None:
             return self.learned
         assert self.encoder is not None
-        encoded: Tensor = self.encoder(torch.eye(TYPES, device=self.encoder[0].weight.device))
+        encoded: Tensor = self.encoder(self.one_hot)
         return encoded
 
 
