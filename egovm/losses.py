@@ -174,10 +174,11 @@ def _random_loss(
         inside = in_window(lattice, level, offsets)
         return torch.where(inside, scores, torch.full_like(scores, -torch.inf))
 
+    step = found.mean.new_tensor((lattice.step_m(level), lattice.step_m(level), lattice.step_rad(level)))
+    between_steps = torch.diag(step**2 / 12.0)  # what the lattice cannot tell apart
+    spread = torch.where((found.landmarks > 0)[:, None, None], found.cov.detach(), torch.zeros_like(found.cov))
     half = lattice.reach * lattice.step_m(level), lattice.reach * lattice.step_rad(level)
-    wide = torch.diag(found.mean.new_tensor((half[0], half[0], half[1])) ** 2)
-    spread = torch.where((found.landmarks > 0)[:, None, None], found.cov, wide)
-    drawn = sample_poses(scored, found.mean, spread, half, generator, config.samples, config.rounds)
+    drawn = sample_poses(scored, found.mean, spread + between_steps, half, generator, config.samples, config.rounds)
     offsets, log_density = (each.to(found.mean) for each in drawn)
     return random_pose_loss(scored(offsets), log_density, truth_score)
 

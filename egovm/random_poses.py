@@ -3,7 +3,9 @@
 A round's proposal is a t distribution of 3 degrees of freedom over the translation, and over the yaw a mixture of a von
 Mises distribution and a uniform one. The first is about what the solver estimates, each next one about the weighted
 mean and covariance of all samples so far. All samples count with the mean of all proposals' densities. (EPro-PnP:
-adaptive multiple importance sampling)
+adaptive multiple importance sampling.) As proposals depend on samples, the integral comes out low: by 1 % with 512
+samples in 4 rounds from a good start, by 4 % from 5 sigma off it. Weighing each round by its own density would be
+unbiased, and six times as uncertain from there.
 """
 
 import math
@@ -59,7 +61,8 @@ class Proposal:
         xy = -0.5 * (_FREEDOM + 2.0) * torch.log1p(white.square().sum(1) / _FREEDOM) - scale
         kappa = self.kappa[:, None]
         peaked = kappa * (torch.cos(apart[..., 2]) - 1.0) - torch.log(2.0 * math.pi * torch.special.i0e(kappa))
-        flat = torch.where(offsets[..., 2].abs() <= self.half_yaw, -math.log(2.0 * self.half_yaw), -math.inf)
+        flat = torch.full_like(peaked, -math.log(2.0 * self.half_yaw))
+        flat = flat.masked_fill(offsets[..., 2].abs() > self.half_yaw, -math.inf)
         return xy + torch.logaddexp(peaked + math.log(1.0 - UNIFORM), flat + math.log(UNIFORM))
 
 

@@ -20,7 +20,9 @@ from tests.egovm.test_projection import UTM, pose
 GROUND_M = -1.8
 
 
-def around(elements: Elements, surfels: Surfels = NO_SURFELS, config: NetworkConfig = PAPER, yaw: float = 0.0) -> Pieces:
+def around(
+    elements: Elements, surfels: Surfels = NO_SURFELS, config: NetworkConfig = PAPER, yaw: float = 0.0
+) -> Pieces:
     return pieces_around(elements, surfels, pose(0.0, 0.0, yaw, np.zeros(3)), config, GROUND_M)
 
 
@@ -122,7 +124,10 @@ def test_the_nearest_are_kept_surfels_within_their_share_and_the_rest_counted(ca
     assert "9 of 17 pieces of map left out: most_elements is 8" in caplog.text
     few = around(lines.chosen(np.arange(2)), near, config)  # surfels take what others leave
     assert np.bincount(few.type)[[Kind.STOP_LINE, SURFEL]].tolist() == [2, 6]
-    assert np.bincount(around(lines, near.chosen(np.arange(1)), config).type)[[Kind.STOP_LINE, SURFEL]].tolist() == [7, 1]
+    assert np.bincount(around(lines, near.chosen(np.arange(1)), config).type)[[Kind.STOP_LINE, SURFEL]].tolist() == [
+        7,
+        1,
+    ]
 
 
 def test_frames_are_padded_under_a_mask() -> None:

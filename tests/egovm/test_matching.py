@@ -11,6 +11,8 @@ from egovm.map_encoder import MapEncoder, SemanticEmbeddings
 from egovm.matching import ElementAttention, Matching, sine_positions
 from sensors.maps.vector_map import Kind
 
+torch.set_num_threads(1)
+
 TINY = msgspec.structs.replace(
     SMALL,
     bev=BevConfig(half_m=8.0, channels=(16, 8, 4)),
@@ -127,7 +129,9 @@ def test_each_kind_is_encoded_by_its_own_numbers() -> None:
         "ratios": given.ratios + 0.1,
         "ends": given.ends + torch.tensor([1.0, -1.0])[:, None] * torch.tensor([1.0, 0.0, 0.0]),  # the middle stays
     }
-    by = {name: (encoder(changed(given, **{name: value}), embeddings) != base).any(-1)[0] for name, value in moved.items()}
+    by = {
+        name: (encoder(changed(given, **{name: value}), embeddings) != base).any(-1)[0] for name, value in moved.items()
+    }
     stands = (type_ == Kind.POLE) | (type_ == Kind.SIGN)
     assert torch.equal(by["height"], stands)
     assert torch.equal(by["normal"], type_ == SURFEL)

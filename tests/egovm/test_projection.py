@@ -1,4 +1,4 @@
-"""Map points onto the BEV plane against the paper's Eq. S1-S4 solved point by point, and what the plane's height does."""
+"""Map points onto the BEV plane against the paper's Eq. S1-S4 solved one by one, and what the plane's height does."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_paint_on_a_grade_stays_where_the_lidar_sees_it_on_the_ground_plane_only
 
 def test_a_tenth_of_a_millimetre_survives_the_coordinates_of_utm() -> None:
     T = pose(0.0, 0.0, 90.0)
-    moved = on_plane(UTM[:2] + (0.0, 1e-4), T, 0.0)
+    moved = on_plane((UTM[0], UTM[1] + 1e-4), T, 0.0)
     assert moved == pytest.approx((1e-4, 0.0), abs=1e-8)
 
 

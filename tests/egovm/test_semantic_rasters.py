@@ -1,5 +1,7 @@
 """Rasters of the map against the distance to every segment, cell by cell."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -29,7 +31,7 @@ def brute(elements: Elements, T: np.ndarray, level: int) -> np.ndarray:
         p = (elements.vertices(i) - T[:3, 3]) @ T[:3, :3]
         p = p[:1] if kind >= Kind.POLE else p
         radius = max(0.15, cell * (0.5**0.5 if kind >= Kind.POLE else 0.5))
-        for a, b in zip(p, np.roll(p, -1, axis=0), strict=True) if len(p) == 1 else zip(p[:-1], p[1:], strict=True):
+        for a, b in pairwise(p if len(p) > 1 else p.repeat(2, axis=0)):
             d = b - a
             s = np.clip(((x - a[0]) * d[0] + (y - a[1]) * d[1]) / max(d[:2] @ d[:2], 1e-12), 0.0, 1.0)
             raster[kind] |= np.hypot(x - a[0] - s * d[0], y - a[1] - s * d[1]) <= radius
@@ -49,7 +51,11 @@ def test_they_equal_the_distance_to_every_segment(seed: int) -> None:
 def test_a_line_is_a_third_of_a_metre_wide_and_never_broken() -> None:
     rasters = semantic_rasters(made((Kind.LANE_LINE, [(-20, 1.06), (20, 1.06)])), np.eye(4), BEV, 0.0)
     widths = [raster[Kind.LANE_LINE].sum(axis=1) for raster in rasters]
-    assert [(w.min(), w.max()) for w in widths] == [(1, 1), (1, 1), (3, 3)]  # around cell 17.62 by 0.5, 35.74 by 0.6, 71.98 by 1.2
+    assert [(w.min(), w.max()) for w in widths] == [
+        (1, 1),
+        (1, 1),
+        (3, 3),
+    ]  # around cell 17.62 by 0.5, 35.74 by 0.6, 71.98 by 1.2
     for angle in np.linspace(0.0, np.pi, 37):
         way = 20.0 * np.array((np.cos(angle), np.sin(angle)))
         for raster in semantic_rasters(made((Kind.LANE_LINE, [-way, way])), np.eye(4), BEV, 0.0):
