@@ -78,8 +78,19 @@ class MatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The nearest so many pieces, points and surfels are used."""
     surfel_share: float = 0.5
     """Of them, what surfels may take where segments and points could fill it, 0..1."""
-    sampled: Literal["ends", "middle"] = "ends"
-    """Where a segment is compared with the BEV: the mean over both its ends, or its middle."""
+    sampled: Literal["ends", "middle"] | int = "ends"
+    """Where a segment is compared with the BEV: the mean over both its ends, its middle, or the mean over so many
+    places, evenly from end to end."""
+
+    def __post_init__(self) -> None:
+        if not self.segment_m > 0.0:
+            raise EgolocError(f"network: matching: segment_m: expected metres above 0, got {self.segment_m:g}")
+        if self.most_elements < 1:
+            raise EgolocError(f"network: matching: most_elements: expected 1 or more, got {self.most_elements}")
+        if not 0.0 <= self.surfel_share <= 1.0:
+            raise EgolocError(f"network: matching: surfel_share: expected 0 to 1, got {self.surfel_share:g}")
+        if isinstance(self.sampled, int) and self.sampled < 2:
+            raise EgolocError(f"network: matching: sampled: expected 2 places or more, got {self.sampled}")
 
 
 class SolverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

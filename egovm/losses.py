@@ -64,13 +64,14 @@ def network_losses(
     (B, TYPES - 1, H, W), not read where ablation has no semantic supervision; generator: of the random poses, CPU.
     """
     zero = truth.offset.new_zeros(())
-    if isinstance(estimate, PoseEstimate):
-        if solver is None:
-            raise ValueError("network_losses: expected the solver that made the estimate")
-        parts = _pose_losses(config, ablation, solver, estimate, truth.offset, generator)
-    else:
-        parts = regression_loss(estimate, truth.offset), zero, zero
-    semantic = semantic_loss(logits, truth.semantic) if ablation.semantic_supervision else zero
+    with torch.autocast(truth.offset.device.type, enabled=False):
+        if isinstance(estimate, PoseEstimate):
+            if solver is None:
+                raise ValueError("network_losses: expected the solver that made the estimate")
+            parts = _pose_losses(config, ablation, solver, estimate, truth.offset, generator)
+        else:
+            parts = regression_loss(_precise(estimate), truth.offset), zero, zero
+        semantic = semantic_loss(logits, truth.semantic) if ablation.semantic_supervision else zero
     weights = config.rmse, config.solver, config.random_pose, config.semantic
     total = sum((weight * part for weight, part in zip(weights, (*parts, semantic), strict=True)), start=zero)
     return Losses(*parts, semantic, total)

@@ -94,9 +94,14 @@ def padded(frames: Sequence[Pieces], count: int | None = None) -> MapElements:
 
 
 def places_of(elements: MapElements, config: MatchingConfig) -> Tensor:
-    """(B, K, P, 2) m, where each piece is compared with the BEV: both its ends, or its middle."""
+    """(B, K, P, 2) m, where each piece is compared with the BEV: as ``sampled`` says."""
     ends = elements.ends[..., :2]
-    return ends if config.sampled == "ends" else ends.mean(2, keepdim=True)
+    if config.sampled == "middle":
+        return ends.mean(2, keepdim=True)
+    if config.sampled == "ends":
+        return ends
+    part = torch.linspace(0.0, 1.0, config.sampled, dtype=ends.dtype, device=ends.device)[:, None]
+    return ends[:, :, :1] + part * (ends[:, :, 1:] - ends[:, :, :1])
 
 
 def _stacked(frames: Sequence[Pieces], name: str, rows: int) -> Tensor:

@@ -10,8 +10,8 @@ from egovm.batch import MapElements
 from egovm.bev_grid import BevGrid
 from egovm.config import NetworkConfig
 from egovm.deformable_attention import DeformableAttention
-from egovm.map_elements import places_of
 from egovm.map_encoder import MapEncoder, SemanticEmbeddings
+from sensors.errors import EgolocError
 
 
 class ElementAttention(nn.Module):
@@ -59,10 +59,10 @@ class Matching(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         first, given = config.bev.channels[0], config.matching
-        self.config, self.grid = given, BevGrid.of(config.bev, 0)
+        self.grid, self.at_middle = BevGrid.of(config.bev, 0), given.sampled == "middle"
         self.semantic = SemanticEmbeddings(first, config.ablation.semantic_embedding)
         self.encoder = MapEncoder(config)
-        references = 2 if given.sampled == "ends" else 1
+        references = 1 if self.at_middle else 2
         self.layers = nn.ModuleList(
             DecoderLayer(first, given.heads, given.points, given.hidden, references)
             for _ in range(given.layers if config.ablation.decoder else 0)
@@ -77,7 +77,9 @@ class Matching(nn.Module):
     def forward(self, elements: MapElements, bev: Tensor) -> tuple[Tensor, ...]:
         """Map embeddings (B, K, C) of each level, 0 where an element is not valid. bev: (B, C, H, W) of level 0."""
         queries = self.encoder(elements, self.semantic())
-        cells = self.grid.cells_from_m(places_of(elements, self.config)).to(queries.dtype)
+        looked_at = elements.ends[..., :2]
+        looked_at = looked_at.mean(2, keepdim=True) if self.at_middle else looked_at
+        cells = self.grid.cells_from_m(looked_at).to(queries.dtype)
         seen = bev + self.position if len(self.layers) else bev
         for layer in self.layers:
             queries = layer(queries, elements.valid, cells, seen)
@@ -89,8 +91,10 @@ class Matching(nn.Module):
 def sine_positions(cells: int, channels: int) -> Tensor:
     """(C, H, W) B^pos: sines and cosines of the row in the first half of the channels, of the column in the second.
 
-    Wave lengths from two cells to four maps, geometrically. (Vaswani et al., in two dimensions; channels by 4)
+    Wave lengths from two cells to four maps, geometrically. (Vaswani et al., in two dimensions)
     """
+    if channels % 4:
+        raise EgolocError(f"network: bev: channels: expected the first to be divisible by 4, got {channels}")
     waves = channels // 4
     length = 2.0 * (2.0 * cells) ** (torch.arange(waves) / max(waves - 1, 1))
     phase = 2.0 * math.pi * torch.arange(cells) / length[:, None]

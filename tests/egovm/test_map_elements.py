@@ -1,6 +1,7 @@
 """The map around a pose as the network takes it."""
 
 import logging
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -145,10 +146,25 @@ def test_frames_are_padded_under_a_mask() -> None:
         padded([two], 2)
 
 
-def test_places_are_ends_or_middles() -> None:
+def test_places_are_ends_middles_or_as_many_as_asked_for() -> None:
     batch = padded([around(made((Kind.STOP_LINE, [(1, 0), (3, 2)])))])
     assert places_of(batch, MatchingConfig()).tolist() == [[[[1.0, 0.0], [3.0, 2.0]]]]
     assert places_of(batch, MatchingConfig(sampled="middle")).tolist() == [[[[2.0, 1.0]]]]
+    assert places_of(batch, MatchingConfig(sampled=3)).tolist() == [[[[1.0, 0.0], [2.0, 1.0], [3.0, 2.0]]]]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"segment_m": 0.0}, "segment_m: expected metres above 0, got 0"),
+        ({"most_elements": 0}, "most_elements: expected 1 or more, got 0"),
+        ({"surfel_share": 1.5}, "surfel_share: expected 0 to 1, got 1.5"),
+        ({"sampled": 1}, "sampled: expected 2 places or more, got 1"),
+    ],
+)
+def test_a_wrong_configuration_is_told(wrong: dict[str, Any], told: str) -> None:
+    with pytest.raises(EgolocError, match=f"network: matching: {told}"):
+        MatchingConfig(**wrong)
 
 
 def test_pieces_do_not_depend_on_where_the_map_lies() -> None:

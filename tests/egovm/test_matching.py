@@ -1,5 +1,7 @@
 """Map queries and the decoder: what padding, order and ablations do, and gradients."""
 
+from typing import Any
+
 import msgspec
 import pytest
 import torch
@@ -9,6 +11,7 @@ from egovm.batch import SURFEL, TYPES, MapElements
 from egovm.config import SMALL, Ablation, BevConfig, MatchingConfig, NetworkConfig
 from egovm.map_encoder import MapEncoder, SemanticEmbeddings
 from egovm.matching import ElementAttention, Matching, sine_positions
+from sensors.errors import EgolocError
 from sensors.maps.vector_map import Kind
 
 torch.set_num_threads(1)
@@ -100,8 +103,8 @@ def test_elements_outside_the_bev_read_nothing_of_it() -> None:
     assert torch.equal(a[0], b[0])
 
 
-@pytest.mark.parametrize("sampled", ["ends", "middle"])
-def test_an_element_looks_at_the_bev_where_it_lies(sampled: str) -> None:
+@pytest.mark.parametrize("sampled", ["ends", "middle", 3])
+def test_an_element_looks_at_the_bev_where_it_lies(sampled: Any) -> None:
     """Offsets are a cell or two at the start: what is changed farther away does not matter."""
     config = msgspec.structs.replace(
         TINY, matching=MatchingConfig(layers=1, heads=2, points=2, hidden=16, sampled=sampled)
@@ -191,3 +194,28 @@ def test_positions_tell_all_cells_apart() -> None:
     assert position.shape == (16, 32, 32)
     assert torch.pdist(position.flatten(1).T).min() > 0.05
     assert torch.equal(position, sine_positions(32, 16))
+
+
+def test_channels_that_no_pairs_of_sines_fill_are_told() -> None:
+    with pytest.raises(EgolocError, match="channels: expected the first to be divisible by 4, got 6"):
+        sine_positions(8, 6)
+
+
+def test_it_exports_with_the_same_outputs() -> None:
+    matching, given = made(TINY), elements(1, 9)
+    columns = tuple(getattr(given, name) for name in MapElements.__slots__)
+
+    class Flat(torch.nn.Module):
+        """Tensors in place of the record."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.matching = matching
+
+        def forward(self, seen: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
+            found: tuple[Tensor, ...] = self.matching(MapElements(*columns), seen)
+            return found
+
+    program = torch.export.export(Flat(), (bev(1), *columns)).module()
+    for a, b in zip(program(bev(1), *columns), matching(given, bev(1)), strict=True):
+        assert torch.allclose(a, b, atol=1e-6)

@@ -186,3 +186,10 @@ def test_an_estimate_comes_with_its_solver() -> None:
     _, estimate, _ = solved()
     with pytest.raises(ValueError, match="the solver that made the estimate"):
         losses(estimate, None)
+
+
+def test_autocast_does_not_reach_the_losses() -> None:
+    solver, estimate, _ = solved(dtype=torch.float32)
+    exact = losses(estimate, solver, TRUTH.float())
+    with torch.autocast("cpu", torch.bfloat16):
+        assert losses(estimate, solver, TRUTH.float()).total.item() == exact.total.item()
