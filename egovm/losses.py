@@ -167,7 +167,7 @@ def _pose_losses(
 def _random_loss(
     config: LossConfig, solver: PoseSolver, found: LevelEstimate, truth_score: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """(B,) L_rp of a level: poses are drawn without gradient within its window, and scored with."""
+    """(B,) L_rp of a level, over its window: poses are drawn without gradient, and scored with."""
     lattice, level = solver.lattice, found.window.level
 
     def scored(offsets: Tensor) -> Tensor:
@@ -179,9 +179,10 @@ def _random_loss(
     between_steps = torch.diag(step**2 / 12.0)  # what the lattice cannot tell apart
     spread = torch.where((found.landmarks > 0)[:, None, None], found.cov.detach(), torch.zeros_like(found.cov))
     half = lattice.reach * lattice.step_m(level), lattice.reach * lattice.step_rad(level)
-    drawn = sample_poses(scored, found.mean, spread + between_steps, half, generator, config.samples, config.rounds)
-    offsets, log_density = (each.to(found.mean) for each in drawn)
-    return random_pose_loss(scored(offsets), log_density, truth_score)
+    _, log_density, scores = sample_poses(
+        scored, found.mean, spread + between_steps, half, generator, config.samples, config.rounds
+    )
+    return random_pose_loss(scores, log_density.to(scores), truth_score)
 
 
 def _mean(values: Tensor, used: Tensor) -> Tensor:

@@ -74,27 +74,29 @@ def sample_poses(
     generator: torch.Generator,
     count: int = 512,
     rounds: int = 4,
-) -> tuple[Tensor, Tensor]:
-    """Poses (B, count, 3) in float64, and the log (B, count) of the density that they were drawn with.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Poses (B, count, 3), the log (B, count) of the density that they were drawn with, and their scores (B, count).
 
     log_score: of the posterior, not normalized, at offsets (B, M, 3) -> (B, M), -inf outside the window; mean (B, 3)
-    and covariance (B, 3, 3): where to begin; half: m and rad of the window. On the CPU, without gradient; the same
-    generator state gives the same poses. The mean of exp(log_score - density) estimates the posterior's integral.
+    and covariance (B, 3, 3): where to begin; half: m and rad of the window. Poses and densities are float64, on the
+    CPU, without gradient; scores are as log_score gives them, with theirs. The same generator state gives the same
+    poses. The mean of exp(score - density) estimates the posterior's integral.
     """
-    with torch.no_grad():
-        proposals: list[Proposal] = []
-        drawn = mean.new_empty((len(mean), 0, 3), dtype=torch.float64, device="cpu")
-        scores = drawn[..., 0]
-        at, spread = mean.to("cpu", torch.float64), covariance.to("cpu", torch.float64)
-        for number in range(rounds):
+    proposals: list[Proposal] = []
+    drawn = torch.empty((len(mean), 0, 3), dtype=torch.float64)
+    log_q, scores = drawn[..., 0], []
+    at, spread = (each.detach().to("cpu", torch.float64) for each in (mean, covariance))
+    for number in range(rounds):
+        with torch.no_grad():
             proposals.append(Proposal.around(at, spread, half))
             new = proposals[-1].draw((number + 1) * count // rounds - drawn.shape[1], generator)
             drawn = torch.cat((drawn, new), 1)
-            scores = torch.cat((scores, log_score(new.to(mean)).to("cpu", torch.float64)), 1)
             log_q = torch.stack([each.log_density(drawn) for each in proposals])
             log_q = torch.logsumexp(log_q, 0) - math.log(len(proposals))
-            at, spread = _moments(drawn, scores - log_q, at, spread)
-        return drawn, log_q
+        scores.append(log_score(new.to(mean)))
+        known = torch.cat([each.detach() for each in scores], 1).to(log_q)
+        at, spread = _moments(drawn, known - log_q, at, spread)
+    return drawn, log_q, torch.cat(scores, 1)
 
 
 def von_mises(kappa: Tensor, generator: torch.Generator) -> Tensor:

@@ -99,9 +99,9 @@ def test_the_random_pose_loss_of_a_gaussian_is_its_closed_form() -> None:
     """-log N(truth; mean, cov): 100 frames of 2048 poses, so that the Monte-Carlo error is 0.2 %."""
     mean, cov = MEAN.repeat(100, 1), COV.repeat(100, 1, 1)
     score = gaussian(mean, cov)
-    drawn, log_q = sample_poses(score, mean, 2.0 * cov, HALF, generator(4), count=2048)
+    _, log_q, scores = sample_poses(score, mean, 2.0 * cov, HALF, generator(4), count=2048)
     at_truth = score(TRUTH.repeat(100, 1)[:, None])[:, 0]
-    loss = random_pose_loss(score(drawn), log_q, at_truth)
+    loss = random_pose_loss(scores, log_q, at_truth)
     expected = -torch.distributions.MultivariateNormal(MEAN[0], COV[0]).log_prob(TRUTH[0])
     error = float(loss.std()) / 10.0
     assert error < 0.003

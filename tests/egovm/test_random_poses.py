@@ -42,8 +42,8 @@ def estimates(start: Tensor, spread: Tensor, frames: int, seed: int = 0, **how: 
     mean, cov = MEAN.repeat(frames, 1), COV.repeat(frames, 1, 1)
     score = gaussian(mean, cov)
     begin, wide = start.repeat(frames, 1), spread.repeat(frames, 1, 1)
-    drawn, log_q = sample_poses(score, begin, wide, HALF, generator(seed), **how)
-    return torch.exp(score(drawn) - log_q - log_integral(COV)).mean(1).numpy()
+    _, log_q, scores = sample_poses(score, begin, wide, HALF, generator(seed), **how)
+    return torch.exp(scores - log_q - log_integral(COV)).mean(1).numpy()
 
 
 def bias(found: np.ndarray) -> tuple[float, float]:
@@ -117,10 +117,10 @@ def test_only_the_window_is_integrated() -> None:
 
     volume = 8.0 * HALF[0] ** 2 * HALF[1]
     wide = torch.diag(torch.tensor([1.5, 1.5, 0.02], dtype=torch.float64)).square()[None]
-    drawn, log_q = sample_poses(
+    _, log_q, scores = sample_poses(
         flat, torch.zeros(400, 3, dtype=torch.float64), wide.repeat(400, 1, 1), HALF, generator(0)
     )
-    found, error = bias((torch.exp(flat(drawn) - log_q).mean(1) / volume).numpy())
+    found, error = bias((torch.exp(scores - log_q).mean(1) / volume).numpy())
     assert error < 0.01
     assert abs(found) < 0.03
 
@@ -134,20 +134,23 @@ def test_the_same_generator_gives_the_same_poses() -> None:
 
 @pytest.mark.parametrize(("count", "rounds"), [(512, 4), (10, 3), (7, 1)])
 def test_as_many_poses_as_asked_for(count: int, rounds: int) -> None:
-    mean, cov = MEAN.repeat(3, 1), COV.repeat(3, 1, 1)
-    drawn, log_q = sample_poses(gaussian(mean, cov), mean, cov, HALF, generator(0), count, rounds)
+    mean, cov = MEAN.repeat(3, 1).requires_grad_(), COV.repeat(3, 1, 1)
+    score = gaussian(mean, cov)
+    drawn, log_q, scores = sample_poses(score, mean, cov, HALF, generator(0), count, rounds)
+    assert torch.equal(scores, score(drawn))
+    assert scores.requires_grad
     assert drawn.shape == (3, count, 3)
     assert log_q.shape == (3, count)
     assert not drawn.requires_grad
 
 
 def test_a_window_that_no_pose_hits_leaves_finite_proposals() -> None:
-    drawn, log_q = sample_poses(lambda o: torch.full(o.shape[:2], -torch.inf), MEAN, COV, HALF, generator(0))
+    drawn, log_q, _ = sample_poses(lambda o: torch.full(o.shape[:2], -torch.inf), MEAN, COV, HALF, generator(0))
     assert torch.isfinite(drawn).all()
     assert torch.isfinite(log_q).all()
 
 
 def test_a_posterior_without_width_is_sampled_all_the_same() -> None:
-    drawn, log_q = sample_poses(gaussian(MEAN, COV * 1e-8), MEAN, torch.zeros(1, 3, 3), HALF, generator(0))
+    drawn, log_q, _ = sample_poses(gaussian(MEAN, COV * 1e-8), MEAN, torch.zeros(1, 3, 3), HALF, generator(0))
     assert torch.isfinite(drawn).all()
     assert torch.isfinite(log_q).all()
