@@ -74,7 +74,7 @@ class ImageAttention(nn.Module):
         row, column = places.unbind(-1)
         inside = (row > -1.0) & (row < height) & (column > -1.0) & (column < width)
         below = torch.stack((row + (image * (height + 1))[:, None, None], column), -1)
-        values = self.attention.values(features.flatten(0, 1))
+        values = self.attention.valued(features.flatten(0, 1))
         apart = nn.functional.pad(values, (0, 0, 0, 1))
         stacked = apart.transpose(0, 1).reshape(heads, -1, len(apart) * (height + 1), width)
         read = deformable_sum(stacked, below.transpose(0, 1), (weights * inside).transpose(0, 1))

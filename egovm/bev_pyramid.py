@@ -4,11 +4,11 @@ import torch
 from torch import Tensor, nn
 
 from egovm.config import NetworkConfig
-from egovm.convolutions import convolution
+from egovm.convolutions import convolution, joint
 
 
 class BevPyramid(nn.Module):
-    """Maps of all levels from that of the first, each with cells half as wide and fewer features than the one before."""
+    """Maps of all levels from that of the first, cells half as wide and features fewer from one to the next."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -38,7 +38,7 @@ class _Finer(nn.Module):
     def __init__(self, before: int, after: int, blocks: int, joined: int) -> None:
         super().__init__()
         self.up = nn.ConvTranspose2d(before, after, 2, 2)
-        self.join = nn.Conv2d(joined, after, 1, bias=False) if joined else None
+        self.join = joint(joined, after) if joined else None
         self.blocks = nn.Sequential(*(convolution(after, after) for _ in range(blocks)))
 
     def forward(self, x: Tensor, fine: Tensor | None) -> Tensor:

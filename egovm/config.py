@@ -181,11 +181,13 @@ class NetworkConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f" {lidar.channels} and {lidar.blocks}"
             )
         if abs(lidar.cell_m - half) > 1e-9:
-            raise EgolocError(f"network: lidar: cell_m: expected {half:g}, half a cell of the BEV, got {lidar.cell_m:g}")
+            raise EgolocError(
+                f"network: lidar: cell_m: expected {half:g}, half a cell of the BEV, got {lidar.cell_m:g}"
+            )
         coarsest = 2 ** (len(lidar.blocks) - 2)
         if self.bev.cells(0) % coarsest:
             raise EgolocError(
-                f"network: lidar: blocks: expected cells of the BEV, {self.bev.cells(0)}, to be a multiple of {coarsest}"
+                f"network: lidar: blocks: expected {self.bev.cells(0)} cells of the BEV to be a multiple of {coarsest}"
             )
 
 
@@ -195,7 +197,7 @@ SMALL = NetworkConfig(
     bev=BevConfig(channels=(64, 32, 16), blocks=(0, 1, 0)),
     camera=CameraConfig(backbone="mobilenetv3_small_100", image_hw=(224, 320), channels=64),
     lidar=LidarConfig(channels=(16, 32, 64), blocks=(1, 2, 3)),
-    fusion=FusionConfig(layers=1, heads=4, cross_points=4, hidden=128),
+    fusion=FusionConfig(cell_m=1.0, layers=1, heads=4, cross_points=4, hidden=128),
     matching=MatchingConfig(layers=2, heads=4, hidden=128),
 )
 PRESETS = {config.name: config for config in (PAPER, SMALL)}

@@ -11,15 +11,16 @@ from torch import Tensor, nn
 from egovm.batch import Points
 from egovm.bev_grid import BevGrid
 from egovm.config import BevConfig, LidarConfig
-from egovm.convolutions import convolution
+from egovm.convolutions import convolution, joint
 
 _POINT = 8
 
 
 @dataclass(frozen=True, slots=True)
 class LidarBev:
-    """features: (B, C, H, W) at the first BEV level; fine: (B, c, 2H, 2W) at the pillars' cells; present: (B,) bool, the
-    frame has points in range."""
+    """features: (B, C, H, W) at the first BEV level; fine: (B, c, 2H, 2W) at the pillars' cells; present: (B,) bool,
+    the frame has points in range.
+    """
 
     features: Tensor
     fine: Tensor
@@ -72,7 +73,7 @@ class PillarEncoder(nn.Module):
 
 
 class LidarEncoder(nn.Module):
-    """Pillars, stages of convolutions on cells each twice as wide as before, brought together at the first BEV level."""
+    """Pillars, stages of convolutions on cells each twice as wide as before, joined at the first BEV level."""
 
     def __init__(self, config: LidarConfig, bev: BevConfig) -> None:
         super().__init__()
@@ -86,8 +87,7 @@ class LidarEncoder(nn.Module):
             nn.Identity() if i == 0 else nn.Upsample(scale_factor=2**i, mode="bilinear")
             for i in range(len(config.blocks) - 1)
         )
-        self.joins = nn.ModuleList(nn.Conv2d(width, bev.channels[0], 1, bias=False) for width in config.channels[1:])
-        self.norm = nn.Sequential(nn.BatchNorm2d(bev.channels[0]), nn.ReLU(inplace=True))
+        self.joins = nn.ModuleList(joint(width, bev.channels[0]) for width in config.channels[1:])
 
     def forward(self, points: Points) -> LidarBev:
         """Features of all frames."""
@@ -97,7 +97,7 @@ class LidarEncoder(nn.Module):
         for stage, up, join in zip(list(self.stages)[1:], self.ups, self.joins, strict=True):
             x = stage(x)
             joined.append(up(join(x)))
-        return LidarBev(self.norm(torch.stack(joined).sum(0)), fine, present)
+        return LidarBev(torch.relu_(sum(joined[1:], joined[0])), fine, present)
 
 
 def _stage(before: int, after: int, count: int, stride: int) -> nn.Sequential:

@@ -7,7 +7,7 @@ of them; naming them is enough.
 
 from pathlib import Path
 from types import ModuleType
-from typing import cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -26,11 +26,13 @@ def backbone(name: str, weights: Path | None = None) -> nn.Module:
     timm = _timm()
     if not timm.is_model(name):
         raise EgolocError(f"camera: backbone: expected a model of timm {timm.__version__}, got {name!r}")
-    given = {} if weights is None else {"pretrained": True, "pretrained_cfg_overlay": {"file": str(weights)}}
+    given: dict[str, Any] = (
+        {} if weights is None else {"pretrained": True, "pretrained_cfg_overlay": {"file": str(weights)}}
+    )
     if weights is not None and not weights.is_file():
         raise EgolocError(f"{weights}: expected a file with weights of {name}, found none")
     try:
-        found = cast(nn.Module, timm.create_model(name, features_only=True, out_indices=(-2, -1), **given))
+        found: nn.Module = timm.create_model(name, features_only=True, out_indices=(-2, -1), **given)
     except (RuntimeError, KeyError, ValueError, OSError) as error:
         if weights is None:
             raise
@@ -50,4 +52,4 @@ def _timm() -> ModuleType:
             torch.library.define(f"torchvision::{name}", _SCHEMA)
     import timm
 
-    return cast(ModuleType, timm)
+    return timm
