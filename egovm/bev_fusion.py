@@ -141,7 +141,7 @@ class BevFusion(nn.Module):
             x = layer(x, position, self.own, features, cells, seen)
         added = self.finer((x - start).transpose(1, 2).reshape(before.shape))
         any_image = images.valid.any(1)[:, None, None, None]
-        return bev + torch.where(any_image, added, torch.zeros_like(added))
+        return torch.addcmul(bev, added, any_image.to(added.dtype))
 
 
 def pillar_anchors(grid: BevGrid, heights_m: tuple[float, ...]) -> Tensor:

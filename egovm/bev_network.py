@@ -25,6 +25,8 @@ class BevNetwork(nn.Module):
         """backbone_weights: a local file with weights of the image backbone; without it they are random."""
         super().__init__()
         self.config = config
+        self.drops = (config.fusion.drop_cameras, config.fusion.drop_lidar) if config.camera is not None else (0.0, 0.0)
+        """Parts of the training steps without images, and without points."""
         self.camera = None if config.camera is None else CameraEncoder(config.camera, backbone_weights)
         self.fusion = None if config.camera is None else BevFusion(config)
         self.lidar = None if config.lidar is None else LidarEncoder(config.lidar, config.bev)
@@ -61,10 +63,10 @@ class BevNetwork(nn.Module):
         """Both, or one of them, at random; one that came alone stays."""
         if points is None or images is None:
             return points, images
-        fusion, drawn = self.config.fusion, torch.rand(()).item()
-        if drawn < fusion.drop_cameras:
+        drawn, (cameras, lidar) = torch.rand(()).item(), self.drops
+        if drawn < cameras:
             return points, None
-        if drawn < fusion.drop_cameras + fusion.drop_lidar:
+        if drawn < cameras + lidar:
             return None, images
         return points, images
 

@@ -44,6 +44,6 @@ class _Finer(nn.Module):
     def forward(self, x: Tensor, fine: Tensor | None) -> Tensor:
         x = self.up(x)
         if self.join is not None and fine is not None:
-            x = x + self.join(fine)
+            x = x.add_(self.join(fine))
         found: Tensor = self.blocks(torch.relu_(x))
         return found

@@ -52,7 +52,7 @@ class PillarEncoder(nn.Module):
         index = ((points.frame * n + nearest[:, 0]) * n + nearest[:, 1])[keep]
         known = self._known(points, cells - nearest, keep, index)
         canvas = known.new_zeros(points.frames * n * n, known.shape[1])
-        canvas = canvas.scatter_reduce(0, index[:, None].expand_as(known), known, "amax")
+        canvas = canvas.scatter_reduce_(0, index[:, None].expand_as(known), known, "amax")
         count = torch.zeros(points.frames, dtype=torch.int64, device=index.device)
         present = count.index_add(0, points.frame[keep], torch.ones_like(index)) > 0
         return canvas.reshape(points.frames, n, n, -1).permute(0, 3, 1, 2), present
@@ -84,20 +84,20 @@ class LidarEncoder(nn.Module):
         )
         # stage i has cells 2^(i - 1) times as wide as the first BEV level; the first is the skip
         self.ups = nn.ModuleList(
-            nn.Identity() if i == 0 else nn.Upsample(scale_factor=2**i, mode="bilinear")
-            for i in range(len(config.blocks) - 1)
+            nn.Upsample(scale_factor=2**i, mode="bilinear") for i in range(1, len(config.blocks) - 1)
         )
         self.joins = nn.ModuleList(joint(width, bev.channels[0]) for width in config.channels[1:])
 
     def forward(self, points: Points) -> LidarBev:
         """Features of all frames."""
         canvas, present = self.pillars(points)
-        fine = x = self.stages[0](canvas)
-        joined = []
-        for stage, up, join in zip(list(self.stages)[1:], self.ups, self.joins, strict=True):
+        fine = self.stages[0](canvas)
+        x = self.stages[1](fine)
+        joined: Tensor = self.joins[0](x)
+        for stage, up, join in zip(list(self.stages)[2:], self.ups, list(self.joins)[1:], strict=True):
             x = stage(x)
-            joined.append(up(join(x)))
-        return LidarBev(torch.relu_(sum(joined[1:], joined[0])), fine, present)
+            joined = joined.add_(up(join(x)))
+        return LidarBev(torch.relu_(joined), fine, present)
 
 
 def _stage(before: int, after: int, count: int, stride: int) -> nn.Sequential:

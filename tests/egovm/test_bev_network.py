@@ -58,9 +58,7 @@ def test_gradients_are_finite_and_reach_every_part(mode: str) -> None:
     trained = network(
         msgspec.structs.replace(TINY, fusion=FusionConfig(1.0, 1, 2, 4, cross_points=4, hidden=16))
     ).train()
-    trained.config = msgspec.structs.replace(
-        trained.config, fusion=msgspec.structs.replace(trained.config.fusion, drop_cameras=0.0, drop_lidar=0.0)
-    )
+    trained.drops = (0.0, 0.0)
     sum(found.square().mean() for found in trained(*given(mode, 2))).backward()
     reached = {name.partition(".")[0] for name, p in trained.named_parameters() if p.grad is not None and p.grad.any()}
     expected = {"full": {"camera", "fusion", "lidar"}, "visual": {"camera", "fusion", "queries"}, "lidar": {"lidar"}}
