@@ -32,13 +32,15 @@ class Moved:
 class Points(Moved):
     """LiDAR points of B frames, one after the other.
 
-    xyz: (P, 3) m; intensity: (P,) 0..1; offset_s: (P,) s from the frame's time; frame: (P,) int64 which of the B.
+    xyz: (P, 3) m; intensity: (P,) 0..1; offset_s: (P,) s from the frame's time; frame: (P,) int64 which of the B;
+    frames: B, since a frame may have no points.
     """
 
     xyz: Tensor
     intensity: Tensor
     offset_s: Tensor
     frame: Tensor
+    frames: int = 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,7 +45,7 @@ class DeformableAttention(nn.Module):
         self.heads, self.points = heads, points
         self.offsets = nn.Linear(channels, heads * points * 2)
         self.weights = nn.Linear(channels, heads * points)
-        self.values = nn.Conv2d(channels, channels, 1)
+        self.values = nn.Linear(channels, channels)
         self.out = nn.Linear(channels, channels)
         self._start(references)
 
@@ -60,8 +60,8 @@ class DeformableAttention(nn.Module):
             self.weights.weight.zero_()
             self.weights.bias.zero_()
         for layer in (self.values, self.out):
-            nn.init.xavier_uniform_(layer.weight.flatten(1))
-            nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
 
     def looks(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         """Where queries (B, Q, C) look: offsets (B, Q, heads, P, 2) in cells, and weights (B, Q, heads, P)."""
@@ -69,6 +69,11 @@ class DeformableAttention(nn.Module):
         offsets = self.offsets(queries).reshape(*shape, 2)
         weights = self.weights(queries).reshape(shape).softmax(-1)
         return offsets, weights
+
+    def valued(self, seen: Tensor) -> Tensor:
+        """(B, C, H, W) what is read of a map (B, C, H, W)."""
+        found: Tensor = self.values(seen.permute(0, 2, 3, 1))
+        return found.permute(0, 3, 1, 2)
 
     def at(self, references: Tensor, offsets: Tensor) -> Tensor:
         """(..., heads, P, 2) places: references (..., R, 2), each for P / R of the points, and offsets around them."""
@@ -79,7 +84,7 @@ class DeformableAttention(nn.Module):
         """(B, Q, C) what queries (B, Q, C) find around references (B, Q, R, 2) in a map (B, C, H, W)."""
         offsets, weights = self.looks(queries)
         cells = self.at(references, offsets).transpose(1, 2).flatten(0, 1)
-        values = split_heads(self.values(seen), self.heads)
+        values = split_heads(self.valued(seen), self.heads)
         read = deformable_sum(values, cells, weights.transpose(1, 2).flatten(0, 1))
         found: Tensor = self.out(read.reshape(len(queries), self.heads, *read.shape[1:]).transpose(1, 2).flatten(2))
         return found

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -243,6 +244,26 @@ class BenchImports:
         _timed("imports", lambda: imports.run(self.sources, self.repeats), self.json)
 
 
+@dataclass(frozen=True)
+class BenchNetwork:
+    """Networks by part: time of a frame, parameters, multiply-adds, memory of a training step, on all cores."""
+
+    repeats: Number = 5
+    """Timed frames of each mode, after two that warm up; the median counts."""
+    paper: bool = True
+    """Also a training step of the paper's sizes: a minute or more, and several GB."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import network
+        from replay.table import bench_table
+
+        _at_least_one(repeats=self.repeats)
+        _printed("network", lambda _: network.run(self.repeats, self.paper), bench_table, self.json, cores="all")
+
+
 BENCHMARKS = {
     "filter": BenchFilter,
     "live": BenchLive,
@@ -250,6 +271,7 @@ BENCHMARKS = {
     "mcap": BenchMcap,
     "maps": BenchMaps,
     "imports": BenchImports,
+    "network": BenchNetwork,
     "gates": BenchGates,
     "faults": BenchFaults,
     "hidden": BenchHidden,
@@ -292,13 +314,17 @@ def _timed(name: str, work: Callable[[], Any], as_json: bool) -> None:
 
 
 def _printed(
-    name: str, work: Callable[[Callable[[str], None]], Any], table: Callable[[Any], Any], as_json: bool
+    name: str,
+    work: Callable[[Callable[[str], None]], Any],
+    table: Callable[[Any], Any],
+    as_json: bool,
+    cores: Literal["one", "all"] = "one",
 ) -> None:
-    """Run on one core, print the result as a table or as JSON. work: hears where it may tell what it is doing."""
+    """Run, print the result as a table or as JSON. work: hears where it may tell what it is doing."""
     from replay.bench.measure import one_core
     from replay.table import output_console
 
-    with stage(f"benchmark {name}") as tell, one_core():
+    with stage(f"benchmark {name}") as tell, one_core() if cores == "one" else nullcontext():
         result = work(tell)
     if as_json:
         print_json(result)

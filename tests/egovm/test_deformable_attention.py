@@ -62,7 +62,7 @@ def test_attention_is_its_parts() -> None:
     references = 5.0 * torch.rand(1, 5, 2, 2, dtype=torch.float64)
     offsets, weights = attention.looks(queries)
     torch.testing.assert_close(weights.sum(-1), torch.ones(1, 5, 2, dtype=torch.float64))
-    values = attention.values(seen)
+    values = attention.valued(seen)
     heads = []
     for head in range(2):
         cells = torch.stack([references[:, :, p // 2] + offsets[:, :, head, p] for p in range(4)], 2)
