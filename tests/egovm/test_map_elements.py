@@ -102,7 +102,7 @@ def test_what_lies_outside_is_cut_off() -> None:
 def test_the_solver_uses_every_piece_that_is_left() -> None:
     """Its rule is that an element lies on the map for all candidates."""
     bev = BevConfig(half_m=12.0, channels=(2, 2, 2))
-    config = msgspec.structs.replace(PAPER, bev=bev)
+    config = msgspec.structs.replace(PAPER, camera=None, bev=bev)
     grid = np.linspace(-30.0, 30.0, 41)
     found = around(made(*((Kind.STOP_LINE, [(-30, y), (30, y + 9)]) for y in grid)), config=config)
     elements = padded([found])
@@ -178,4 +178,4 @@ def test_pieces_do_not_depend_on_where_the_map_lies() -> None:
 
 def test_a_bev_that_is_narrower_than_the_search_is_told() -> None:
     with pytest.raises(EgolocError, match="half_m: expected more than the search range, got 3"):
-        usable_half_m(msgspec.structs.replace(PAPER, bev=BevConfig(half_m=3.0)))
+        usable_half_m(msgspec.structs.replace(PAPER, camera=None, bev=BevConfig(half_m=3.0)))

@@ -18,6 +18,7 @@ torch.set_num_threads(1)
 
 TINY = msgspec.structs.replace(
     SMALL,
+    camera=None,
     bev=BevConfig(half_m=8.0, channels=(16, 8, 4)),
     matching=MatchingConfig(layers=2, heads=2, points=2, hidden=16),
 )

@@ -92,14 +92,14 @@ def test_following_the_gradient_brings_the_posterior_to_the_truth() -> None:
     """Of a flat map, by 120 steps on the features alone: to a tenth of the finer level's step of 0.25 m and 0.5 deg."""
     places = layout(2, 12, 8.0)
     maps = [torch.zeros(1, 1, 48 << n, 48 << n, dtype=torch.float64, requires_grad=True) for n in range(2)]
-    solver = PoseSolver(LATTICE).double().requires_grad_(False)
+    solver, config = PoseSolver(LATTICE).double().requires_grad_(False), LossConfig(samples=128)
     optimizer = torch.optim.Adam(maps, lr=0.1)
     ones, valid = [torch.ones(1, 12, 1).double()] * 2, torch.ones(1, 12, dtype=torch.bool)
     logits, drawn = rasters(1)
     first = None
     for step in range(120):
         estimate = solver(maps, ones, places[None], valid)
-        found = network_losses(CONFIG, Ablation(), Truth(TRUTH, drawn), estimate, solver, logits, generator(step))
+        found = network_losses(config, Ablation(), Truth(TRUTH, drawn), estimate, solver, logits, generator(step))
         first = found if first is None else first
         optimizer.zero_grad()
         found.total.backward()

@@ -7,7 +7,7 @@ from egovm.batch import TYPES
 from egovm.config import SMALL, BevConfig
 from egovm.semantics import PRIOR, SemanticHead
 
-CONFIG = msgspec.structs.replace(SMALL, bev=BevConfig(half_m=8.0, channels=(8, 4, 4)))
+CONFIG = msgspec.structs.replace(SMALL, camera=None, bev=BevConfig(half_m=8.0, channels=(8, 4, 4)))
 
 
 def test_a_logit_is_the_dot_of_feature_and_embedding_over_the_prior() -> None:
