@@ -32,13 +32,15 @@ class Moved:
 class Points(Moved):
     """LiDAR points of B frames, one after the other.
 
-    xyz: (P, 3) m; intensity: (P,) 0..1; offset_s: (P,) s from the frame's time; frame: (P,) int64 which of the B.
+    xyz: (P, 3) m; intensity: (P,) 0..1; offset_s: (P,) s from the frame's time; frame: (P,) int64 which of the B;
+    frames: B, since a frame may have no points.
     """
 
     xyz: Tensor
     intensity: Tensor
     offset_s: Tensor
     frame: Tensor
+    frames: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +62,8 @@ class MapElements(Moved):
     """K pieces of map of each frame, in body axes at the initial pose.
 
     type: (B, K) int64 Kind or SURFEL; ends: (B, K, 2, 3) m, both ends of a segment on the BEV plane (Eq. S1-S4), twice
-    the same place for points and surfels, z as far above the plane; height: (B, K) m of poles and signs, 0 else;
-    normal: (B, K, 3) and ratios: (B, K, 2) of surfels, 0 else; valid: (B, K) bool.
+    the same place for points and surfels, z as far above the plane (0 for segments); height: (B, K) m of poles and
+    signs, 0 else; normal: (B, K, 3) and ratios: (B, K, 2) of surfels, 0 else; valid: (B, K) bool.
     """
 
     type: Tensor

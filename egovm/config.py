@@ -3,6 +3,7 @@
 ``paper`` has the paper's sizes, ``small`` trains and runs on two CPU cores. A config goes with the weights, as TOML.
 """
 
+from itertools import pairwise
 from typing import Literal
 
 import msgspec
@@ -24,6 +25,8 @@ class BevConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Cells of the levels, m, coarse to fine."""
     channels: tuple[int, ...] = (256, 128, 64)
     """Features of the levels."""
+    blocks: tuple[int, ...] = (0, 1, 1)
+    """3x3 convolutions of each level: of the first after fusion, of each next one after its upsampling."""
 
     def cells(self, level: int) -> int:
         """Cells along a side at a level."""
@@ -36,33 +39,40 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     backbone: str = "ese_vovnet39b"
     """A timm model that gives features at stride 16 and 32."""
     image_hw: tuple[int, int] = (448, 640)
-    """Height and width to which images are brought, pixels."""
+    """Height and width to which images are brought, pixels; multiples of 32."""
     channels: int = 256
+    """Of the features; those of the first BEV level."""
 
 
 class LidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Points into BEV features."""
 
     cell_m: float = 0.25
-    """Side of a pillar, m."""
-    channels: int = 64
-    """Features of a pillar."""
-    blocks: tuple[int, ...] = (3, 5)
+    """Side of a pillar, m: the BEV cell of the second level, whose upsampling takes the first stage's features."""
+    channels: tuple[int, ...] = (64, 128, 256)
+    """Features of the stages; a pillar has those of the first."""
+    blocks: tuple[int, ...] = (3, 5, 5)
     """Convolutions of each stage; the first works on pillars, each next one on cells twice as wide."""
 
 
 class FusionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """BEV queries looking at images."""
 
+    cell_m: float = 0.5
+    """Side of a query's cell, m: that of the first level or a multiple of it."""
     layers: int = 4
     heads: int = 8
     self_points: int = 4
     """Places around itself that a query looks at, by head."""
     heights_m: tuple[float, ...] = (-1.5, 0.0, 1.5, 3.0)
-    """Heights of the pillar's anchors that are projected into the images, m above the plane."""
+    """Heights of the pillar's anchors that are projected into the images, m in body axes."""
     cross_points: int = 8
-    """Places around each anchor's projection, by head."""
+    """Places in an image that a query looks at, by head, shared out among its anchors (as BEVFormer's)."""
     hidden: int = 512
+    drop_cameras: float = 0.2
+    """Part of the training steps that go without images, so that the same weights serve LiDAR alone."""
+    drop_lidar: float = 0.2
+    """Part of them that go without points, for cameras alone."""
 
 
 class MatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -76,8 +86,21 @@ class MatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Polylines are cut into pieces of at most this length, m."""
     most_elements: int = 512
     """The nearest so many pieces, points and surfels are used."""
-    sampled: Literal["ends", "middle"] = "ends"
-    """Where a segment is compared with the BEV: the mean over both its ends, or its middle."""
+    surfel_share: float = 0.5
+    """Of them, what surfels may take where segments and points could fill it, 0..1."""
+    sampled: Literal["ends", "middle"] | int = "ends"
+    """Where a segment is compared with the BEV: the mean over both its ends, its middle, or the mean over so many
+    places, evenly from end to end."""
+
+    def __post_init__(self) -> None:
+        if not self.segment_m > 0.0:
+            raise EgolocError(f"network: matching: segment_m: expected metres above 0, got {self.segment_m:g}")
+        if self.most_elements < 1:
+            raise EgolocError(f"network: matching: most_elements: expected 1 or more, got {self.most_elements}")
+        if not 0.0 <= self.surfel_share <= 1.0:
+            raise EgolocError(f"network: matching: surfel_share: expected 0 to 1, got {self.surfel_share:g}")
+        if isinstance(self.sampled, int) and self.sampled < 2:
+            raise EgolocError(f"network: matching: sampled: expected 2 places or more, got {self.sampled}")
 
 
 class SolverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -128,19 +151,66 @@ class NetworkConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if self.camera is None and self.lidar is None:
             raise EgolocError("network: expected a camera, a lidar, or both")
-        if len(self.bev.cell_m) != len(self.bev.channels):
+        bev = self.bev
+        if not len(bev.cell_m) == len(bev.channels) == len(bev.blocks):
             raise EgolocError(
-                f"network: bev: expected as many channels as cells, got {self.bev.channels} for {self.bev.cell_m}"
+                f"network: bev: expected as many channels and blocks as cells, got {bev.channels} and {bev.blocks} for"
+                f" {bev.cell_m}"
+            )
+        if any(abs(2.0 * fine - coarse) > 1e-9 for coarse, fine in pairwise(bev.cell_m)):
+            raise EgolocError(f"network: bev: cell_m: expected each half as wide as the one before, got {bev.cell_m}")
+        self._check_camera()
+        self._check_lidar()
+
+    def _check_camera(self) -> None:
+        if self.camera is None:
+            return
+        if any(side % 32 or side <= 0 for side in self.camera.image_hw):
+            raise EgolocError(f"network: camera: image_hw: expected multiples of 32, got {self.camera.image_hw}")
+        if self.camera.channels != self.bev.channels[0]:
+            raise EgolocError(
+                f"network: camera: channels: expected those of the first BEV level, {self.bev.channels[0]}, got"
+                f" {self.camera.channels}"
+            )
+        times = self.fusion.cell_m / self.bev.cell_m[0]
+        if times < 1.0 or times % 1.0 or self.bev.cells(0) % times:
+            raise EgolocError(
+                f"network: fusion: cell_m: expected a multiple of {self.bev.cell_m[0]:g} that divides the plane, got"
+                f" {self.fusion.cell_m:g}"
+            )
+        dropped = self.fusion.drop_cameras, self.fusion.drop_lidar
+        if min(dropped) < 0.0 or sum(dropped) > 1.0:
+            raise EgolocError(
+                f"network: fusion: drop_cameras, drop_lidar: expected 0 or more and together at most 1, got {dropped}"
+            )
+
+    def _check_lidar(self) -> None:
+        if self.lidar is None:
+            return
+        lidar, half = self.lidar, self.bev.cell_m[0] / 2.0
+        if len(lidar.channels) != len(lidar.blocks) or len(lidar.blocks) < 2 or min(lidar.blocks) < 1:
+            raise EgolocError(
+                "network: lidar: expected channels and blocks of two stages or more, a block or more each, got"
+                f" {lidar.channels} and {lidar.blocks}"
+            )
+        if abs(lidar.cell_m - half) > 1e-9:
+            raise EgolocError(
+                f"network: lidar: cell_m: expected {half:g}, half a cell of the BEV, got {lidar.cell_m:g}"
+            )
+        coarsest = 2 ** (len(lidar.blocks) - 2)
+        if self.bev.cells(0) % coarsest:
+            raise EgolocError(
+                f"network: lidar: blocks: expected {self.bev.cells(0)} cells of the BEV to be a multiple of {coarsest}"
             )
 
 
 PAPER = NetworkConfig()
 SMALL = NetworkConfig(
     name="small",
-    bev=BevConfig(channels=(64, 32, 16)),
+    bev=BevConfig(channels=(64, 32, 16), blocks=(0, 1, 0)),
     camera=CameraConfig(backbone="mobilenetv3_small_100", image_hw=(224, 320), channels=64),
-    lidar=LidarConfig(channels=32, blocks=(2, 3)),
-    fusion=FusionConfig(layers=1, heads=4, cross_points=4, hidden=128),
+    lidar=LidarConfig(channels=(16, 32, 64), blocks=(1, 2, 3)),
+    fusion=FusionConfig(cell_m=1.0, layers=1, heads=4, cross_points=4, hidden=128),
     matching=MatchingConfig(layers=2, heads=4, hidden=128),
 )
 PRESETS = {config.name: config for config in (PAPER, SMALL)}

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any
+from contextlib import nullcontext
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -37,13 +38,17 @@ def timed(name: str, work: Callable[[], Any], as_json: bool) -> None:
 
 
 def printed(
-    name: str, work: Callable[[Callable[[str], None]], Any], table: Callable[[Any], Any], as_json: bool
+    name: str,
+    work: Callable[[Callable[[str], None]], Any],
+    table: Callable[[Any], Any],
+    as_json: bool,
+    cores: Literal["one", "all"] = "one",
 ) -> None:
-    """Run on one core, print the result as a table or as JSON. work: hears where it may tell what it is doing."""
+    """Run, print the result as a table or as JSON. work: hears where it may tell what it is doing."""
     from replay.bench.measure import one_core
     from replay.table import output_console
 
-    with stage(f"benchmark {name}") as tell, one_core():
+    with stage(f"benchmark {name}") as tell, one_core() if cores == "one" else nullcontext():
         result = work(tell)
     if as_json:
         print_json(result)

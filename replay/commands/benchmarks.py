@@ -1,6 +1,7 @@
 """egoloc bench: all benchmarks by name."""
 
 from replay.commands.bench_maps import BenchImports, BenchLidar, BenchMaps
+from replay.commands.bench_network import BenchNetwork, BenchSolver
 from replay.commands.benching import (
     BenchConsistency,
     BenchFaults,
@@ -20,6 +21,8 @@ BENCHMARKS = {
     "maps": BenchMaps,
     "imports": BenchImports,
     "lidar": BenchLidar,
+    "solver": BenchSolver,
+    "network": BenchNetwork,
     "gates": BenchGates,
     "faults": BenchFaults,
     "hidden": BenchHidden,

@@ -1,0 +1,105 @@
+"""LiDAR encoder: points into pillars with scatter_reduce, then 2-D convolutions to the BEV (PointPillars, Lang et al.).
+
+A frame without points in range gives no NaN, and says so.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from egovm.batch import Points
+from egovm.bev_grid import BevGrid
+from egovm.config import BevConfig, LidarConfig
+from egovm.convolutions import convolution, joint
+
+_POINT = 8
+
+
+@dataclass(frozen=True, slots=True)
+class LidarBev:
+    """features: (B, C, H, W) at the first BEV level; fine: (B, c, 2H, 2W) at the pillars' cells; present: (B,) bool,
+    the frame has points in range.
+    """
+
+    features: Tensor
+    fine: Tensor
+    present: Tensor
+
+
+class PillarEncoder(nn.Module):
+    """Each point through an MLP, the most of each feature by pillar. Nothing is computed for an empty pillar.
+
+    A point is known by where it lies in its pillar and from the mean of its points, its height and intensity: not by
+    where the pillar is, so that the features of a thing do not depend on its place.
+    """
+
+    def __init__(self, config: LidarConfig, bev: BevConfig) -> None:
+        super().__init__()
+        self.grid = BevGrid(round(2.0 * bev.half_m / config.cell_m), config.cell_m)
+        self.z_m = bev.z_m
+        width = config.channels[0]
+        self.layers = nn.Sequential(nn.Linear(_POINT, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+
+    def forward(self, points: Points) -> tuple[Tensor, Tensor]:
+        """Pillars (B, C, n, n), zero where there is no point, and (B,) bool of frames that have points in range."""
+        n = self.grid.cells
+        cells = self.grid.cells_from_m(points.xyz[:, :2])
+        nearest = torch.floor(cells + 0.5).to(torch.int64)
+        low, high = self.z_m
+        height = points.xyz[:, 2]
+        keep = ((nearest >= 0) & (nearest < n)).all(-1) & (height >= low) & (height < high)
+        index = ((points.frame * n + nearest[:, 0]) * n + nearest[:, 1])[keep]
+        known = self._known(points, cells - nearest, keep, index)
+        canvas = known.new_zeros(points.frames * n * n, known.shape[1])
+        canvas = canvas.scatter_reduce_(0, index[:, None].expand_as(known), known, "amax")
+        count = torch.zeros(points.frames, dtype=torch.int64, device=index.device)
+        present = count.index_add(0, points.frame[keep], torch.ones_like(index)) > 0
+        return canvas.reshape(points.frames, n, n, -1).permute(0, 3, 1, 2), present
+
+    def _known(self, points: Points, part: Tensor, keep: Tensor, index: Tensor) -> Tensor:
+        """(P, C) of points that are kept. part: (all, 2) where a point lies in its pillar, in cells."""
+        xyz = points.xyz[keep]
+        spread = index[:, None].expand_as(xyz)
+        empty = xyz.new_zeros(points.frames * self.grid.cells**2, 3)
+        mean = empty.scatter_reduce(0, spread, xyz, "mean", include_self=False)[index]
+        low, high = self.z_m
+        height = (2.0 * xyz[:, 2:] - (low + high)) / (high - low)
+        parts = (2.0 * part[keep], (xyz - mean) / self.grid.cell_m, height, points.intensity[keep, None])
+        # with a point alone in its pillar told from one among many: its mean is itself
+        alone = (xyz == mean).all(-1, keepdim=True).to(xyz.dtype)
+        known: Tensor = self.layers(torch.cat((*parts, alone), -1))
+        return known
+
+
+class LidarEncoder(nn.Module):
+    """Pillars, stages of convolutions on cells each twice as wide as before, joined at the first BEV level."""
+
+    def __init__(self, config: LidarConfig, bev: BevConfig) -> None:
+        super().__init__()
+        self.pillars = PillarEncoder(config, bev)
+        widths = (config.channels[0], *config.channels)
+        self.stages = nn.ModuleList(
+            _stage(widths[i], widths[i + 1], count, 1 if i == 0 else 2) for i, count in enumerate(config.blocks)
+        )
+        # stage i has cells 2^(i - 1) times as wide as the first BEV level; the first is the skip
+        self.ups = nn.ModuleList(
+            nn.Upsample(scale_factor=2**i, mode="bilinear") for i in range(1, len(config.blocks) - 1)
+        )
+        self.joins = nn.ModuleList(joint(width, bev.channels[0]) for width in config.channels[1:])
+
+    def forward(self, points: Points) -> LidarBev:
+        """Features of all frames."""
+        canvas, present = self.pillars(points)
+        fine = self.stages[0](canvas)
+        x = self.stages[1](fine)
+        joined: Tensor = self.joins[0](x)
+        for stage, up, join in zip(list(self.stages)[2:], self.ups, list(self.joins)[1:], strict=True):
+            x = stage(x)
+            joined = joined.add_(up(join(x)))
+        return LidarBev(torch.relu_(joined), fine, present)
+
+
+def _stage(before: int, after: int, count: int, stride: int) -> nn.Sequential:
+    first = convolution(before, after, stride)
+    return nn.Sequential(first, *(convolution(after, after) for _ in range(count - 1)))
