@@ -34,7 +34,7 @@ class RegressionSolver(nn.Module):
         )
 
     def forward(self, embeddings: Tensor, valid: Tensor) -> RegressedPose:
-        """embeddings: (B, K, C); valid: (B, K) bool. The network's third number is in degrees, near the others in size."""
+        """embeddings: (B, K, C); valid: (B, K) bool. The last layer's yaw is in degrees, of the size of its metres."""
         found = valid.any(1)
         if embeddings.shape[1] == 0:
             return RegressedPose(embeddings.new_zeros((len(embeddings), 3)), found)

@@ -50,7 +50,7 @@ def dot_window(
     (B, K, C); places: (B, K, P, 2) m, P points whose features are averaged; valid: (B, K) bool.
     """
     height, width = features.shape[-2:]
-    size = window_cells(lattice, height, width)
+    size = window_cells(lattice, level, height, width)
     cells = _cells(lattice, level, places[:, :, :, None], yaws(lattice, level, places), (height, width))
     inside = _inside(cells.detach(), lattice.reach, (height, width))
     used = valid & inside.flatten(2).all(-1)
@@ -72,14 +72,14 @@ def dot_window(
     return Window(lattice, level, (height, width), dots, places, corners, used)
 
 
-def window_cells(lattice: LatticeConfig, height: int, width: int) -> int:
+def window_cells(lattice: LatticeConfig, level: int, height: int, width: int) -> int:
     """Side S of a patch that holds all that candidates read of a point inside for all of them.
 
     Over the range of yaws a coordinate moves by at most that range times the other one, which is at most half of the
     map less the translations. Raises where the map is smaller than a patch.
     """
     half = (max(height, width) - 1) / 2 - lattice.reach
-    moved = math.ceil(1.001 * max(half, 0.0) * 2.0 * math.radians(lattice.half_deg))
+    moved = math.ceil(1.001 * max(half, 0.0) * 2.0 * lattice.reach * lattice.step_rad(level))
     size = lattice.steps + 1 + moved
     if min(height, width) < size:
         raise EgolocError(f"BEV map: expected at least {size} x {size} cells, got {height} x {width}")

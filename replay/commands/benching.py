@@ -224,12 +224,32 @@ class BenchMaps:
         _timed("maps", lambda: maps.run(self.repeats, self.km), self.json)
 
 
+@dataclass(frozen=True)
+class BenchSolver:
+    """The pose solver beside sampling features at every candidate: time, memory, growth, on one core."""
+
+    repeats: Number = 3
+    """Timed turns of each row, after one that warms up; the median counts."""
+    elements: Number = 500
+    """Map elements."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, _: tuple[str, ...]) -> None:
+        """Run the benchmark."""
+        from replay.bench import solver
+
+        _at_least_one(repeats=self.repeats, elements=self.elements)
+        _timed("solver", lambda: solver.run(self.repeats, self.elements), self.json)
+
+
 BENCHMARKS = {
     "filter": BenchFilter,
     "live": BenchLive,
     "replay": BenchReplay,
     "mcap": BenchMcap,
     "maps": BenchMaps,
+    "solver": BenchSolver,
     "gates": BenchGates,
     "faults": BenchFaults,
     "hidden": BenchHidden,

@@ -28,7 +28,7 @@ def inputs(
         return torch.randn(*shape, generator=draw, dtype=torch.float64)
 
     levels = range(lattice.levels)
-    features = [normal(samples, 6 - 2 * (l % 2), cells << l, cells << l) for l in levels]
+    features = [normal(samples, 6 - 2 * (level % 2), cells << level, cells << level) for level in levels]
     embeddings = [2.0 * normal(samples, elements, plane.shape[1]) for plane in features]
     places = (torch.rand(samples, elements, points, 2, generator=draw, dtype=torch.float64) - 0.5) * 2.0 * half_m
     valid = torch.rand(samples, elements, generator=draw) < 0.8
@@ -161,8 +161,8 @@ def test_gradients_of_the_estimate() -> None:
         centres = (torch.zeros(1, 3).double(), torch.tensor([[0.1, -0.2, 0.01]]).double())
         solver.__dict__["tau"] = tau
         levels = [
-            solver.level(l, given[l], given[2 + l], given[4][:, :, None], torch.ones(1, 3) > 0, centres[l])
-            for l in range(2)
+            solver.level(each, given[each], given[2 + each], given[4][:, :, None], torch.ones(1, 3) > 0, centres[each])
+            for each in range(2)
         ]
         offset = torch.tensor([[[0.11, -0.07, 0.013]]]).double()
         return tuple(x for each in levels for x in (each.mean, each.cov, solver.scores_at(each.window, offset)))
@@ -188,7 +188,7 @@ def test_gradients_against_the_reference() -> None:
 
 @pytest.mark.parametrize("groups", [1, 3])
 def test_the_kernel_and_torch_agree(groups: int) -> None:
-    features, embeddings, places, valid = inputs(SMALL, 2, 150, cells=20, half_m=4.0)
+    features, embeddings, _, valid = inputs(SMALL, 2, 150, cells=20, half_m=4.0)
     plane = features[0].permute(0, 2, 3, 1)
     corners = torch.randint(0, 20 - 8, (2, 150, 2), generator=torch.Generator().manual_seed(1))
     given = [plane.requires_grad_(), embeddings[0].requires_grad_()]
@@ -205,7 +205,7 @@ def test_the_kernel_and_torch_agree(groups: int) -> None:
 
 
 def test_the_operator_keeps_torchs_rules() -> None:
-    features, embeddings, places, valid = inputs(SMALL, 1, 3, cells=10)
+    features, embeddings, _, valid = inputs(SMALL, 1, 3, cells=10)
     corners = torch.zeros(1, 3, 2, dtype=torch.int64)
     given = (features[0].permute(0, 2, 3, 1).detach().requires_grad_(), embeddings[0].requires_grad_())
     torch.library.opcheck(torch.ops.egovm.patch_dots.default, (*given, corners, valid, 8, 1))
@@ -219,7 +219,9 @@ def test_groups_go_through_their_h() -> None:
     flat = torch.stack([vector(pose) for pose in lattice_poses(0)])
     by_pose = solver.scores_at(found.window, flat[None])
     assert torch.allclose(by_pose, found.scores.flatten(1), atol=1e-9)
-    halves = [dot_window(LATTICE, 0, features[0][:, s], embeddings[0][..., s], places, valid) for s in (slice(3), slice(3, 6))]
+    halves = [
+        dot_window(LATTICE, 0, features[0][:, s], embeddings[0][..., s], places, valid) for s in (slice(3), slice(3, 6))
+    ]
     dots = torch.cat([dots_at(half, flat[None]) for half in halves], -1)
     alike = solver.similarity[0](dots)
     wanted = torch.where(found.window.valid[:, None], alike, 0.0).sum(-1) / found.landmarks
@@ -283,7 +285,12 @@ def test_one_element_and_repeated_ones(elements: int) -> None:
     place = torch.tensor([[[1.3, -2.1]]]).double()
     one = estimate((features, embeddings, place, torch.ones(1, 1) > 0))
     many = estimate(
-        (features, [e.expand(-1, elements, -1) for e in embeddings], place.expand(-1, elements, -1), torch.ones(1, elements) > 0)
+        (
+            features,
+            [e.expand(-1, elements, -1) for e in embeddings],
+            place.expand(-1, elements, -1),
+            torch.ones(1, elements) > 0,
+        )
     )
     assert one.found.all()
     assert torch.isfinite(one.levels[2].cov).all()

@@ -21,7 +21,9 @@ class Plain(nn.Module):
         super().__init__()
         self.solver = PoseSolver(LATTICE, groups=groups)
 
-    def forward(self, features: list[Tensor], embeddings: list[Tensor], places: Tensor, valid: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        self, features: list[Tensor], embeddings: list[Tensor], places: Tensor, valid: Tensor
+    ) -> tuple[Tensor, ...]:
         found = self.solver(features, embeddings, places, valid)
         moments = [x for each in found.levels for x in (each.mean, each.cov)]
         return found.offset, found.modes, found.weights, found.found, *moments
@@ -29,7 +31,7 @@ class Plain(nn.Module):
 
 def inputs(seed: int, valid: float = 0.8) -> tuple[list[Tensor], list[Tensor], Tensor, Tensor]:
     draw = torch.Generator().manual_seed(seed)
-    features = [torch.randn(1, c, 60 << l, 60 << l, generator=draw) for l, c in enumerate(CHANNELS)]
+    features = [torch.randn(1, c, 60 << level, 60 << level, generator=draw) for level, c in enumerate(CHANNELS)]
     embeddings = [torch.randn(1, 100, c, generator=draw) for c in CHANNELS]
     places = (torch.rand(1, 100, 2, 2, generator=draw) - 0.5) * 28.0
     return features, embeddings, places, torch.rand(1, 100, generator=draw) < valid

@@ -1,0 +1,169 @@
+"""`egoloc bench solver`: the pose solver beside sampling features at every candidate, at the networks' sizes.
+
+Both solve the same random scene on one thread, by turns, so that a noisy hour is the same for both; backward is that
+of the composed offset and the covariances to features and embeddings. In float64 both must say the same.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from egovm.lattice import PAPER
+from egovm.pose_solver import PoseEstimate, PoseSolver
+from egovm.solver_window import window_cells
+from replay.bench import solver_sampling
+from replay.bench.measure import conditions, row
+from replay.bench.solver_memory import peak_growth_mb
+from replay.bench.solver_scene import CELLS, SIZES, Scene, scene
+
+ELEMENTS = 500
+SCALING = (125, 250, 500, 1000)
+PEER = "sampling"
+
+
+def run(repeats: int = 3, elements: int = ELEMENTS, scaling: tuple[int, ...] = SCALING) -> dict[str, Any]:
+    """Times over so many repeats, of so many elements; scaling: numbers of elements over which the growth is taken."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        rows, ratios = [], {}
+        for size in SIZES:
+            found, ratio = _beside(size, elements, repeats)
+            rows += found
+            ratios |= ratio
+        rows += [*_growth(scaling, repeats), *_memory(elements), *_work(elements), *_agreement(elements)]
+    finally:
+        torch.set_num_threads(threads)
+    facts = {
+        "elements": elements,
+        "cells": CELLS,
+        "channels": SIZES,
+        "candidates": f"{PAPER.steps}^3 at {PAPER.levels} levels",
+        "threads": 1,
+        "repeats": repeats,
+    }
+    return {"bench": "solver", "rows": rows, "ratios": ratios, "conditions": conditions(["torch", "numba"], **facts)}
+
+
+def solve(solver: PoseSolver, given: Scene) -> PoseEstimate:
+    """The estimate of a scene."""
+    found: PoseEstimate = solver(given.features, given.embeddings, given.places, given.valid)
+    return found
+
+
+def _beside(size: str, elements: int, repeats: int) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    """Milliseconds of both, forward and with gradients, and how many times a peer takes ours."""
+    given, solver = scene(SIZES[size], elements), PoseSolver()
+    for leaf in given.leaves():
+        leaf.requires_grad_()
+    first = scene(SIZES[size], elements, last=False)
+    ours: dict[str, Callable[[], object]] = {
+        f"egoloc, {size}": lambda: solve(solver, given),
+        f"egoloc, {size}, channels first": lambda: solve(solver, first),
+        f"{PEER}, {size}": lambda: solver_sampling.sampled_estimate(given),
+    }
+    with torch.no_grad():
+        forward = _by_turns(ours, repeats)
+    both = _by_turns(
+        {
+            f"egoloc, {size}": lambda: _backward(given, *_ours(solver, given)),
+            f"{PEER}, {size}": lambda: _backward(given, *_theirs(given)),
+        },
+        repeats,
+    )
+    rows = [row(name, "forward_ms", taken) for name, taken in forward.items()]
+    rows += [row(name, "forward_backward_ms", taken) for name, taken in both.items()]
+    ratios = {
+        f"{PEER} / egoloc, {size}, {what}": _median(times, f"{PEER}, {size}") / _median(times, f"egoloc, {size}")
+        for what, times in (("forward", forward), ("forward and backward", both))
+    }
+    return rows, ratios
+
+
+def _ours(solver: PoseSolver, given: Scene) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    found = solve(solver, given)
+    return found.offset, [each.cov for each in found.levels]
+
+
+def _theirs(given: Scene) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    offset, _, covs = solver_sampling.sampled_estimate(given)
+    return offset, covs
+
+
+def _backward(given: Scene, offset: torch.Tensor, covs: list[torch.Tensor]) -> None:
+    torch.autograd.grad(offset.sum() + torch.stack(covs).sum(), given.leaves())
+
+
+def _by_turns(works: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+    """Milliseconds of each, one after the other in every repeat, after a turn that warms up."""
+    taken: dict[str, list[float]] = {name: [] for name in works}
+    for turn in range(repeats + 1):
+        for name, work in works.items():
+            start = time.perf_counter()
+            work()
+            if turn:
+                taken[name].append(1e3 * (time.perf_counter() - start))
+    return taken
+
+
+def _growth(scaling: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
+    """Forward time over the number of elements, and the exponent of its growth: 1 is linear, less has a fixed part."""
+    solver = PoseSolver()
+    scenes = {k: scene(SIZES["paper"], k) for k in scaling}
+    works: dict[str, Callable[[], object]] = {
+        f"egoloc, paper, {k} elements": lambda given=given: solve(solver, given)  # type: ignore[misc]
+        for k, given in scenes.items()
+    }
+    with torch.no_grad():
+        taken = _by_turns(works, repeats)
+    least = [min(each) for each in taken.values()]
+    exponent = float(np.polyfit(np.log(scaling), np.log(least), 1)[0])
+    return [
+        *(row(name, "forward_ms", each) for name, each in taken.items()),
+        row("egoloc, paper", "growth_exponent", [exponent]),
+    ]
+
+
+def _memory(elements: int) -> list[dict[str, Any]]:
+    return [
+        row("egoloc, paper", "peak_mb_beyond_inputs", [peak_growth_mb("paper", elements, True)]),
+        row("egoloc, paper, channels first", "peak_mb_beyond_inputs", [peak_growth_mb("paper", elements, False)]),
+    ]
+
+
+def _work(elements: int) -> list[dict[str, Any]]:
+    """Millions of multiply-adds of features: dots of patches against samples and dots at every candidate."""
+    rows = []
+    for size, channels in SIZES.items():
+        patches = sum(
+            window_cells(PAPER, level, n, n) ** 2 * c * elements
+            for level, (n, c) in enumerate(zip(CELLS, channels, strict=True))
+        )
+        sampled = sum(solver_sampling.multiply_adds(elements, c) for c in channels)
+        rows += [
+            row(f"egoloc, {size}", "million_multiply_adds", [patches / 1e6]),
+            row(f"{PEER}, {size}", "million_multiply_adds", [sampled / 1e6]),
+        ]
+    return rows
+
+
+def _agreement(elements: int) -> list[dict[str, Any]]:
+    """Largest differences from the peer over all levels, in float64: m and rad, and their products."""
+    given = scene(SIZES["small"], elements, torch.float64)
+    with torch.no_grad():
+        ours = solve(PoseSolver(), given)
+        offset, means, covs = solver_sampling.sampled_estimate(given)
+    mean = max(float((a.mean[0] - b).abs().max()) for a, b in zip(ours.levels, means, strict=True))
+    cov = max(float((a.cov[0] - b).abs().max()) for a, b in zip(ours.levels, covs, strict=True))
+    return [
+        row("egoloc against sampling, float64", "mean_difference", [mean]),
+        row("egoloc against sampling, float64", "covariance_difference", [cov]),
+        row("egoloc against sampling, float64", "offset_difference", [float((ours.offset[0] - offset).abs().max())]),
+    ]
+
+
+def _median(taken: dict[str, list[float]], name: str) -> float:
+    return float(np.median(taken[name]))
