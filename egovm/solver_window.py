@@ -184,7 +184,7 @@ def _read(window: Window) -> tuple[Tensor, Tensor]:
     weights = _weights(local - base)
     steps = torch.arange(window.lattice.steps + 1, device=base.device)
     row, column = base.to(torch.int64).unbind(-1)
-    index = (row[..., None, None] + steps[:, None]) * size + column[..., None, None] + steps
+    index = (row * size + column)[..., None] + (steps[:, None] * size + steps).flatten()
     flat = index.flatten(3)[:, :, :, None].expand(-1, -1, -1, window.dots.shape[3], -1)
     patches = window.dots.flatten(4).gather(4, flat)
     return torch.unflatten(patches, -1, (len(around), len(steps) ** 2)), weights[:, :, :, None]

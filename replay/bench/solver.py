@@ -24,23 +24,33 @@ SCALING = (125, 250, 500, 1000)
 PEER = "sampling"
 
 
-def run(repeats: int = 3, elements: int = ELEMENTS, scaling: tuple[int, ...] = SCALING) -> dict[str, Any]:
-    """Times over so many repeats, of so many elements; scaling: numbers of elements over which the growth is taken."""
+def run(
+    repeats: int = 3,
+    elements: int = ELEMENTS,
+    scaling: tuple[int, ...] = SCALING,
+    sizes: tuple[str, ...] = tuple(SIZES),
+) -> dict[str, Any]:
+    """Times over so many repeats, of so many elements; scaling: numbers of elements over which the growth is taken.
+
+    sizes: names of SIZES; growth and memory are those of the first, the agreement that of the last.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        rows, ratios = [], {}
-        for size in SIZES:
+        rows: list[dict[str, Any]] = []
+        ratios: dict[str, float] = {}
+        for size in sizes:
             found, ratio = _beside(size, elements, repeats)
             rows += found
             ratios |= ratio
-        rows += [*_growth(scaling, repeats), *_memory(elements), *_work(elements), *_agreement(elements)]
+        rows += _growth(sizes[0], scaling, repeats)
+        rows += [*_memory(sizes[0], elements), *_work(sizes, elements), *_agreement(sizes[-1], elements)]
     finally:
         torch.set_num_threads(threads)
     facts = {
         "elements": elements,
         "cells": CELLS,
-        "channels": SIZES,
+        "channels": {size: SIZES[size] for size in sizes},
         "candidates": f"{PAPER.steps}^3 at {PAPER.levels} levels",
         "threads": 1,
         "repeats": repeats,
@@ -109,12 +119,13 @@ def _by_turns(works: dict[str, Callable[[], object]], repeats: int) -> dict[str,
     return taken
 
 
-def _growth(scaling: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
+def _growth(size: str, scaling: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
     """Forward time over the number of elements, and the exponent of its growth: 1 is linear, less has a fixed part."""
     solver = PoseSolver()
-    scenes = {k: scene(SIZES["paper"], k) for k in scaling}
+    largest = scene(SIZES[size], max(scaling))
+    scenes = {k: largest.first(k) for k in scaling}
     works: dict[str, Callable[[], object]] = {
-        f"egoloc, paper, {k} elements": lambda given=given: solve(solver, given)  # type: ignore[misc]
+        f"egoloc, {size}, {k} elements": lambda given=given: solve(solver, given)  # type: ignore[misc]
         for k, given in scenes.items()
     }
     with torch.no_grad():
@@ -123,21 +134,22 @@ def _growth(scaling: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
     exponent = float(np.polyfit(np.log(scaling), np.log(least), 1)[0])
     return [
         *(row(name, "forward_ms", each) for name, each in taken.items()),
-        row("egoloc, paper", "growth_exponent", [exponent]),
+        row(f"egoloc, {size}", "growth_exponent", [exponent]),
     ]
 
 
-def _memory(elements: int) -> list[dict[str, Any]]:
+def _memory(size: str, elements: int) -> list[dict[str, Any]]:
     return [
-        row("egoloc, paper", "peak_mb_beyond_inputs", [peak_growth_mb("paper", elements, True)]),
-        row("egoloc, paper, channels first", "peak_mb_beyond_inputs", [peak_growth_mb("paper", elements, False)]),
+        row(f"egoloc, {size}", "peak_mb_beyond_inputs", [peak_growth_mb(size, elements, True)]),
+        row(f"egoloc, {size}, channels first", "peak_mb_beyond_inputs", [peak_growth_mb(size, elements, False)]),
     ]
 
 
-def _work(elements: int) -> list[dict[str, Any]]:
+def _work(sizes: tuple[str, ...], elements: int) -> list[dict[str, Any]]:
     """Millions of multiply-adds of features: dots of patches against samples and dots at every candidate."""
     rows = []
-    for size, channels in SIZES.items():
+    for size in sizes:
+        channels = SIZES[size]
         patches = sum(
             window_cells(PAPER, level, n, n) ** 2 * c * elements
             for level, (n, c) in enumerate(zip(CELLS, channels, strict=True))
@@ -150,9 +162,9 @@ def _work(elements: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _agreement(elements: int) -> list[dict[str, Any]]:
+def _agreement(size: str, elements: int) -> list[dict[str, Any]]:
     """Largest differences from the peer over all levels, in float64: m and rad, and their products."""
-    given = scene(SIZES["small"], elements, torch.float64)
+    given = scene(SIZES[size], elements, torch.float64)
     with torch.no_grad():
         ours = solve(PoseSolver(), given)
         offset, means, covs = solver_sampling.sampled_estimate(given)

@@ -21,6 +21,11 @@ class Scene:
     places: Tensor
     valid: Tensor
 
+    def first(self, elements: int) -> "Scene":
+        """The same BEV features, and so many of the elements."""
+        embeddings = [each[:, :elements] for each in self.embeddings]
+        return Scene(self.features, embeddings, self.places[:, :elements], self.valid[:, :elements])
+
     def leaves(self) -> list[Tensor]:
         """The tensors that gradients go to."""
         return [*self.features, *self.embeddings]

@@ -200,8 +200,23 @@ def test_the_kernel_and_torch_agree(groups: int) -> None:
     for a, b in zip(*results, strict=True):
         assert a.abs().max() > 0
         assert torch.allclose(a, b, atol=1e-12)
-    short = patch_dots(plane.detach().bfloat16(), embeddings[0].detach().float(), corners, valid, 8, groups)
-    assert torch.allclose(short, results[0][0].float(), atol=0.3)  # features that are no float go through torch
+
+
+@pytest.mark.parametrize("groups", [1, 3])
+def test_features_that_are_no_float_go_through_torch(groups: int) -> None:
+    """As features on other devices do: the operator's own way there, forward and backward, against autograd's."""
+    features, embeddings, _, valid = inputs(SMALL, 2, 150, cells=20, half_m=4.0)
+    plane = features[0].permute(0, 2, 3, 1).bfloat16().requires_grad_()
+    given = [plane, embeddings[0].float().requires_grad_()]
+    corners = torch.randint(0, 20 - 8, (2, 150, 2), generator=torch.Generator().manual_seed(1))
+    weight = torch.randn(2, 150, groups, 8, 8, generator=torch.Generator().manual_seed(2))
+    results = []
+    for dots, first in ((patch_dots, plane), (gathered_dots, plane.float())):
+        found = dots(first, given[1], corners, valid, 8, groups)
+        results.append((found, *torch.autograd.grad((weight * found).sum(), given)))
+    for a, b, tolerance in zip(*results, (1e-5, 0.01, 1e-4), strict=True):  # the features' gradient is bfloat16
+        assert a.dtype == b.dtype
+        assert torch.allclose(a, b, atol=tolerance, rtol=tolerance)
 
 
 def test_the_operator_keeps_torchs_rules() -> None:

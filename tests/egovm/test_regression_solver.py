@@ -55,7 +55,7 @@ def test_it_learns_what_embeddings_say() -> None:
     x = torch.cat((truth / units, torch.zeros(64, 5)), 1)[:, None] + 0.05 * torch.randn(64, 6, 8)
     valid = torch.rand(64, 6) < 0.8
     valid[:, 0] = True
-    for _ in range(200):
+    for _ in range(120):
         loss = ((solver(x, valid).offset - truth) / units).abs().mean()
         optimizer.zero_grad()
         loss.backward()
