@@ -120,7 +120,10 @@ def _by_turns(works: dict[str, Callable[[], object]], repeats: int) -> dict[str,
 
 
 def _growth(size: str, scaling: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
-    """Forward time over the number of elements, and the exponent of its growth: 1 is linear, less has a fixed part."""
+    """Forward time over the number of elements: its exponent (1 is linear, less has a fixed part) and its line.
+
+    The line's fixed part and slope, and the largest departure from it as a share of the time.
+    """
     solver = PoseSolver()
     largest = scene(SIZES[size], max(scaling))
     scenes = {k: largest.first(k) for k in scaling}
@@ -132,9 +135,14 @@ def _growth(size: str, scaling: tuple[int, ...], repeats: int) -> list[dict[str,
         taken = _by_turns(works, repeats)
     least = [min(each) for each in taken.values()]
     exponent = float(np.polyfit(np.log(scaling), np.log(least), 1)[0])
+    slope, fixed = np.polyfit(scaling, least, 1)
+    departure = float(np.abs(fixed + slope * np.array(scaling) - least).max() / max(least))
     return [
         *(row(name, "forward_ms", each) for name, each in taken.items()),
         row(f"egoloc, {size}", "growth_exponent", [exponent]),
+        row(f"egoloc, {size}", "fixed_ms", [float(fixed)]),
+        row(f"egoloc, {size}", "us_per_element", [1e3 * float(slope)]),
+        row(f"egoloc, {size}", "departure_from_line", [departure]),
     ]
 
 
