@@ -26,14 +26,16 @@ def dot_patches(features: Any, embeddings: Any, corners: Any, valid: Any, dots: 
             if not valid[b, n]:
                 continue
             row, column = corners[b, n, 0], corners[b, n, 1]
-            for r in range(size):
-                for c in range(size):
-                    for g in range(groups):
-                        cell, embedding = features[b, row + r, column + c, g], embeddings[b, n, g]
+            for g in range(groups):
+                embedding = embeddings[b, n, g]
+                for r in range(size):
+                    cells, line = features[b, row + r], dots[b, n, g, r]
+                    for c in range(size):
+                        cell = cells[column + c, g]
                         total = dots.dtype.type(0)
                         for k in range(channels):
                             total += cell[k] * embedding[k]
-                        dots[b, n, g, r, c] = total
+                        line[c] = total
 
 
 @kernel(nogil=True, fastmath=_SUMS)
@@ -46,11 +48,12 @@ def add_embedding_gradient(features: Any, corners: Any, valid: Any, gradient: An
             if not valid[b, n]:
                 continue
             row, column = corners[b, n, 0], corners[b, n, 1]
-            for r in range(size):
-                for c in range(size):
-                    for g in range(groups):
-                        cell, embedding = features[b, row + r, column + c, g], into[b, n, g]
-                        weight = gradient[b, n, g, r, c]
+            for g in range(groups):
+                embedding = into[b, n, g]
+                for r in range(size):
+                    cells, line = features[b, row + r], gradient[b, n, g, r]
+                    for c in range(size):
+                        cell, weight = cells[column + c, g], line[c]
                         for k in range(channels):
                             embedding[k] += weight * cell[k]
 
@@ -65,10 +68,11 @@ def add_feature_gradient(embeddings: Any, corners: Any, valid: Any, gradient: An
             if not valid[b, n]:
                 continue
             row, column = corners[b, n, 0], corners[b, n, 1]
-            for r in range(size):
-                for c in range(size):
-                    for g in range(groups):
-                        cell, embedding = into[b, row + r, column + c, g], embeddings[b, n, g]
-                        weight = gradient[b, n, g, r, c]
+            for g in range(groups):
+                embedding = embeddings[b, n, g]
+                for r in range(size):
+                    cells, line = into[b, row + r], gradient[b, n, g, r]
+                    for c in range(size):
+                        cell, weight = cells[column + c, g], line[c]
                         for k in range(channels):
                             cell[k] += weight * embedding[k]

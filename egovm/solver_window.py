@@ -50,7 +50,7 @@ def dot_window(
     (B, K, C); places: (B, K, P, 2) m, P points whose features are averaged; valid: (B, K) bool.
     """
     height, width = features.shape[-2:]
-    size = window_cells(lattice, height, width)
+    size = window_cells(lattice, level, height, width)
     cells = _cells(lattice, level, places[:, :, :, None], yaws(lattice, level, places), (height, width))
     inside = _inside(cells.detach(), lattice.reach, (height, width))
     used = valid & inside.flatten(2).all(-1)
@@ -72,14 +72,14 @@ def dot_window(
     return Window(lattice, level, (height, width), dots, places, corners, used)
 
 
-def window_cells(lattice: LatticeConfig, height: int, width: int) -> int:
+def window_cells(lattice: LatticeConfig, level: int, height: int, width: int) -> int:
     """Side S of a patch that holds all that candidates read of a point inside for all of them.
 
     Over the range of yaws a coordinate moves by at most that range times the other one, which is at most half of the
     map less the translations. Raises where the map is smaller than a patch.
     """
     half = (max(height, width) - 1) / 2 - lattice.reach
-    moved = math.ceil(1.001 * max(half, 0.0) * 2.0 * math.radians(lattice.half_deg))
+    moved = math.ceil(1.001 * max(half, 0.0) * 2.0 * lattice.reach * lattice.step_rad(level))
     size = lattice.steps + 1 + moved
     if min(height, width) < size:
         raise EgolocError(f"BEV map: expected at least {size} x {size} cells, got {height} x {width}")
@@ -184,7 +184,7 @@ def _read(window: Window) -> tuple[Tensor, Tensor]:
     weights = _weights(local - base)
     steps = torch.arange(window.lattice.steps + 1, device=base.device)
     row, column = base.to(torch.int64).unbind(-1)
-    index = (row[..., None, None] + steps[:, None]) * size + column[..., None, None] + steps
+    index = (row * size + column)[..., None] + (steps[:, None] * size + steps).flatten()
     flat = index.flatten(3)[:, :, :, None].expand(-1, -1, -1, window.dots.shape[3], -1)
     patches = window.dots.flatten(4).gather(4, flat)
     return torch.unflatten(patches, -1, (len(around), len(steps) ** 2)), weights[:, :, :, None]

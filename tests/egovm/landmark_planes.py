@@ -1,4 +1,4 @@
-"""BEV maps whose best pose is known: the distance to the nearest landmark, as the vehicle sees them from the true pose."""
+"""BEV maps whose best pose is known: the distance to the nearest landmark, seen from the true pose."""
 
 import torch
 from torch import Tensor

@@ -57,8 +57,14 @@ def on_map(seen: Tensor, cells: tuple[int, int], cell_m: float) -> Tensor:
 
 
 def solve_level(
-    features: Tensor, embeddings: Tensor, places: Tensor, valid: Tensor, cell_m: float, poses: list[Tensor],
-    factor: float = 1.0, alpha: float = 1.0,
+    features: Tensor,
+    embeddings: Tensor,
+    places: Tensor,
+    valid: Tensor,
+    cell_m: float,
+    poses: list[Tensor],
+    factor: float = 1.0,
+    alpha: float = 1.0,
 ) -> Reference:
     """features: (C, H, W); embeddings: (K, C); places: (K, P, 2) m about the centre; valid: (K,) bool."""
     elements, points = places.shape[:2]
@@ -82,8 +88,14 @@ def solve_level(
 
 
 def solve(
-    features: list[Tensor], embeddings: list[Tensor], places: Tensor, valid: Tensor, cell_m: tuple[float, ...],
-    half_m: float = 3.0, half_deg: float = 3.0, steps: int = 13,
+    features: list[Tensor],
+    embeddings: list[Tensor],
+    places: Tensor,
+    valid: Tensor,
+    cell_m: tuple[float, ...],
+    half_m: float = 3.0,
+    half_deg: float = 3.0,
+    steps: int = 13,
 ) -> tuple[Tensor, list[Reference]]:
     """All levels of one sample: the composed offset (3,) and what each level said."""
     pose, found = torch.eye(3, dtype=torch.float64), []

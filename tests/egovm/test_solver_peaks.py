@@ -25,13 +25,12 @@ def estimate(places: Tensor, truths: Tensor, sigma_m: float = 0.3, sharp: float 
     return found
 
 
-@settings(max_examples=8, deadline=None, derandomize=True)
+@settings(max_examples=6, deadline=None, derandomize=True)
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.integers(0, 3))
 def test_a_peak_is_found_from_any_start(x: float, y: float, yaw_deg: float, seed: int) -> None:
     truth = torch.tensor([x, y, yaw_deg * DEGREE], dtype=torch.float64)
     found = estimate(layout(seed), truth[None])
     error = (found.offset[0] - truth).abs()
-    print(error.tolist())
     assert found.found.all()
     assert (error[:2] < 0.01).all()
     assert error[2] < 0.02 * DEGREE
@@ -81,7 +80,8 @@ def test_masses_of_two_modes() -> None:
 
 def test_a_broad_mode_that_weighs_more_than_the_highest_peak_comes_first() -> None:
     modes, weights = modes_of(bumps((0.3, 0, 4, 0, 0.6), (0.7, 0, -3, 0, 1.2)))
-    assert weights[0] > 0.6 > 0.4 > weights[1] > 0.0
+    assert weights[0] > 0.6
+    assert 0.0 < weights[1] < 0.4
     assert modes[0, 0] < 0 < modes[1, 0]
 
 
@@ -104,7 +104,7 @@ def test_one_mode_is_told_as_one(one: Tensor) -> None:
 def test_a_histogram_that_a_prior_cut_has_modes_where_it_is_left() -> None:
     log_p = bumps((0.5, 0, 4, 0, 0.7), (0.5, 0, -3, 0, 0.7))
     log_p[:, :, :6] = -torch.inf
-    modes, weights = modes_of(log_p.log_softmax(2))
+    modes, weights = modes_of(log_p - log_p.logsumexp((1, 2, 3)))
     assert modes[0, 0] == pytest.approx(2.0, abs=0.02)
     assert torch.isfinite(modes).all()
     assert weights[1] < 1e-3
@@ -114,10 +114,10 @@ def test_the_covariance_is_that_of_the_evidence() -> None:
     """Elements on a circle of radius r: information sharp / sigma^2 in each axis of the plane, times r^2 in yaw."""
     angle = torch.arange(36, dtype=torch.float64) * 10.0 * DEGREE
     places = 20.0 * torch.stack((angle.cos(), angle.sin()), -1)
-    found = estimate(places, torch.zeros(1, 3).double(), sigma_m=0.3, sharp=4.0)
-    variance = 0.3**2 / 4.0
+    found = estimate(places, torch.zeros(1, 3).double(), sigma_m=0.3, sharp=12.0)
+    variance = 0.3**2 / 12.0
     wanted = torch.tensor([variance, variance, variance / 20.0**2]).double()
-    assert torch.allclose(found.levels[2].cov[0].diagonal(), wanted, rtol=0.1)
+    assert torch.allclose(found.levels[2].cov[0].diagonal(), wanted, rtol=0.05)
 
 
 def test_more_evidence_is_sharper_with_a_smaller_alpha() -> None:
