@@ -60,14 +60,16 @@ class PillarEncoder(nn.Module):
     def _known(self, points: Points, part: Tensor, keep: Tensor, index: Tensor) -> Tensor:
         """(P, C) of points that are kept. part: (all, 2) where a point lies in its pillar, in cells."""
         xyz = points.xyz[keep]
-        spread = index[:, None].expand_as(xyz)
-        empty = xyz.new_zeros(points.frames * self.grid.cells**2, 3)
-        mean = empty.scatter_reduce(0, spread, xyz, "mean", include_self=False)[index]
+        # sum and count at once: ONNX has no mean of what is scattered
+        counted = torch.cat((xyz, torch.ones_like(xyz[:, :1])), -1)
+        empty = xyz.new_zeros(points.frames * self.grid.cells**2, 4)
+        total = empty.scatter_reduce_(0, index[:, None].expand_as(counted), counted, "sum")[index]
+        mean = total[:, :3] / total[:, 3:]
         low, high = self.z_m
         height = (2.0 * xyz[:, 2:] - (low + high)) / (high - low)
         parts = (2.0 * part[keep], (xyz - mean) / self.grid.cell_m, height, points.intensity[keep, None])
-        # with a point alone in its pillar told from one among many: its mean is itself
-        alone = (xyz == mean).all(-1, keepdim=True).to(xyz.dtype)
+        # a point alone in its pillar is told from one in the middle of many
+        alone = (total[:, 3:] == 1.0).to(xyz.dtype)
         known: Tensor = self.layers(torch.cat((*parts, alone), -1))
         return known
 

@@ -1,0 +1,58 @@
+"""The BEV side as ONNX: onnxruntime gives the same maps, for another number of points than it was exported with."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from egovm.batch import Images, Points
+from egovm.bev_network import BevNetwork
+from egovm.convolutions import deployed
+from tests.egovm.scenes import TINY, images, points
+
+
+class OfTensors(nn.Module):
+    """One frame told by tensors alone: points, then what is in Images, if anything."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, xyz: Tensor, intensity: Tensor, *looked: Tensor) -> tuple[Tensor, ...]:
+        nothing = torch.zeros_like(intensity)
+        found: tuple[Tensor, ...] = self.network(
+            Points(xyz, intensity, nothing, nothing.long(), 1), Images(*looked) if looked else None
+        )
+        return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["full", "lidar"])
+@pytest.mark.filterwarnings("ignore")  # of the exporter, about itself
+def test_onnxruntime_gives_the_same_maps(mode: str, tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    runtime = pytest.importorskip("onnxruntime")
+    torch.manual_seed(0)
+    exported = OfTensors(deployed(BevNetwork(TINY))).eval()
+    seen, looked = points(), images()
+    rest = (looked.rgb, looked.K, looked.T_camera_body, looked.valid) if mode == "full" else ()
+    count = {0: torch.export.Dim("points", min=2, max=10**6)}
+    program = torch.onnx.export(
+        exported,
+        (seen.xyz, seen.intensity, *rest),
+        dynamo=True,
+        dynamic_shapes=(count, count, tuple(None for _ in rest)),
+        opset_version=18,
+        verbose=False,
+    )
+    assert program is not None
+    program.save(tmp_path / "bev.onnx")
+    session = runtime.InferenceSession(tmp_path / "bev.onnx")
+    more = points(777)
+    given = (more.xyz, more.intensity, *rest)
+    names = [each.name for each in session.get_inputs()]
+    found = session.run(None, dict(zip(names, (each.numpy() for each in given), strict=True)))
+    with torch.no_grad():
+        for level, expected in enumerate(exported(*given)):
+            torch.testing.assert_close(torch.from_numpy(found[level]), expected, atol=1e-5, rtol=0.0)
