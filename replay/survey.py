@@ -25,7 +25,7 @@ from sensors.maps.vector_map import VectorMap
 from sensors.maps.voxels import Voxels
 from sensors.mcap.frames import read_frames
 from sensors.mcap.io import read_log
-from sensors.mcap.topics import LIDAR
+from sensors.mcap.topics import CAMERA, LIDAR
 from sensors.records import Trajectory
 from sensors.vehicle import Vehicle
 
@@ -73,6 +73,7 @@ def read_drive(
     """
     topics = dict(topics or {})
     lidar = topics.pop(LIDAR, None)
+    topics.pop(CAMERA, None)
     log = read_log(path, topics)
     if log.map_frame is not None and frame is not None and log.map_frame != frame:
         raise EgolocError(f"{path}: expected map frame {text_of(frame)}, got a log in {text_of(log.map_frame)}")
@@ -98,7 +99,7 @@ def survey_drive(drive: Drive, config: SurfelConfig, reach: Reach, tell: Tell) -
     except EgolocError as error:
         raise EgolocError(f"{drive.path}: {error}") from None
     points, stamps = 0, []
-    for placed in steps.placed(read_frames(drive.path, drive.lidar)):
+    for placed in steps.placed(read_frames(drive.path, drive.lidar, images=False)):
         voxels.add(placed.xyz, placed.frame_ns)
         points += len(placed.xyz)
         stamps.append(placed.frame_ns)
@@ -144,7 +145,7 @@ def align_drive(
     elif map is not None:
         points = _of_map(map, drive.frame, config)
     arm = drive.vehicle.reference_lever_arm
-    frames = read_frames(drive.path, drive.lidar)
+    frames = read_frames(drive.path, drive.lidar, images=False)
     try:
         found = align(frames, drive.trajectory, points, config, arm, reach, tell)
     except EgolocError as error:

@@ -1,4 +1,4 @@
-"""Frames: what the sensors that look around saw at one moment. LiDAR sweeps, each with the pose of its LiDAR.
+"""Frames: what the sensors that look around saw at one moment: LiDAR sweeps and images, each with the sensor's pose.
 
 A log holds thousands of them, some MB each: they are read and written one at a time, never all at once.
 """
@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sensors.errors import EgolocError
+from sensors.images import Image
+from sensors.rotation import check_rigid
 
 Floats = NDArray[np.float64]
 
@@ -40,9 +42,7 @@ class Sweep:
         self._column("intensity", (count,), np.float32, np.nan)
         self._column("ring", (count,), np.int16, -1)
         T = self._column("T_body_lidar", (4, 4), np.float64, np.nan)
-        R = T[:3, :3]
-        if not (np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0.0):
-            raise EgolocError(f"Sweep.T_body_lidar: expected a rigid transform, got {T.tolist()}")
+        check_rigid("Sweep.T_body_lidar", T)
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -64,8 +64,17 @@ class Sweep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """What was seen at t_ns, and came in at arrival_ns (Unix UTC, ns)."""
+    """What was seen at t_ns, and came in at arrival_ns (Unix UTC, ns).
+
+    images: at most one of each camera, each taken at its own t_ns, which is near the frame's.
+    """
 
     t_ns: int
     arrival_ns: int
     sweeps: tuple[Sweep, ...] = ()
+    images: tuple[Image, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [image.name for image in self.images]
+        if len(set(names)) < len(names):
+            raise EgolocError(f"Frame.images: expected one of each camera, got {', '.join(names)}")

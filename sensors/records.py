@@ -15,6 +15,7 @@ from sensors.errors import EgolocError
 from sensors.frames import Frame as Frame  # noqa: PLC0414 (part of the records, in a file of their own)
 from sensors.frames import Sweep as Sweep  # noqa: PLC0414
 from sensors.geodesy import MapFrame
+from sensors.images import Image as Image  # noqa: PLC0414
 from sensors.vehicle import Vehicle
 
 Floats = NDArray[np.float64]

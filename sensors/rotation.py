@@ -4,6 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from sensors.errors import EgolocError
+
 Floats = NDArray[np.float64]
 
 
@@ -90,3 +92,11 @@ def interpolate_q(t: ArrayLike, t_known: ArrayLike, q_known: ArrayLike) -> Float
     mixed = (1 - weight) * a + weight * b
     result: Floats = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
     return result
+
+
+def check_rigid(name: str, T: Floats) -> None:
+    """Raise EgolocError, naming it, unless a (4, 4) matrix turns and shifts, and does nothing else."""
+    R = T[:3, :3]
+    turns = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0.0
+    if not (turns and (T[3] == (0.0, 0.0, 0.0, 1.0)).all()):
+        raise EgolocError(f"{name}: expected a rigid transform, got {T.tolist()}")

@@ -19,7 +19,7 @@ class Convert:
     """Turn a recorded drive of another format into an MCAP log with ROS 2 messages."""
 
     format: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FORMAT")]
-    """rtklib, imu-gnss-drive, comma2k19, novatel, rosbag, gtsam-kitti or argoverse2."""
+    """rtklib, imu-gnss-drive, comma2k19, novatel, rosbag, gtsam-kitti, argoverse2 or nuscenes-frame."""
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SRC")]
     """The file or folder to read."""
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEST.mcap")]

@@ -16,6 +16,7 @@ FORMATS = {
     "novatel": "NovAtel OEM7 ASCII log",
     "gtsam-kitti": "folder gtsam/Data of the gtsam package",
     "argoverse2": "folder of an Argoverse 2 sensor or LiDAR log",
+    "nuscenes-frame": "folder of nuScenes keyframes with a calibration.json as mmdetection3d writes it",
 }
 """Name of each format and what SRC is."""
 
@@ -34,7 +35,7 @@ def load(format: str, src: Path, topics: Mapping[str, str] | None = None) -> Log
 
 
 def frames(format: str, src: Path) -> Iterator[Frame]:
-    """LiDAR frames of a recording in order of time, read one at a time; none where its format has none."""
+    """LiDAR and camera frames of a recording in order of time, read one at a time; none where its format has none."""
     src = Path(src)
     module = _module(format, src)
     found: Iterator[Frame] = module.frames(src) if hasattr(module, "frames") else iter(())

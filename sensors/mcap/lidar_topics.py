@@ -1,6 +1,6 @@
-"""Which topics of a log are LiDARs, and where each LiDAR sits on the vehicle."""
+"""Which topics of a log are LiDARs, and where each sensor sits on the vehicle."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import msgspec
@@ -17,6 +17,7 @@ from sensors.mcap.point_cloud import POINT_CLOUD
 from sensors.mcap.sections import Container, open_container
 from sensors.mcap.single_messages import MessageWalk
 from sensors.mcap.static_tf import TOPIC, TRANSFORMS, decode_transforms
+from sensors.mcap.topics import LIDAR
 
 Floats = NDArray[np.float64]
 
@@ -24,14 +25,14 @@ WORLD_FRAMES = frozenset({"map", "world", "odom", "earth"})
 """frame_id of clouds that somebody put together in the world: no LiDAR saw them at one moment."""
 
 
-def names_of(chosen: str | Sequence[str] | None) -> tuple[str, ...]:
+def names_of(chosen: str | Sequence[str] | None, sensor: str = LIDAR) -> tuple[str, ...]:
     """Topics of a choice: one, several, or several between commas; empty: whatever the log has."""
     if chosen is None:
         return ()
     given = chosen.split(",") if isinstance(chosen, str) else chosen
     names = tuple(name.strip() for name in given)
     if not names or not all(names) or len(set(names)) < len(names):
-        raise EgolocError(f"topics.lidar: expected topics, with commas between several, got {chosen!r}")
+        raise EgolocError(f"topics.{sensor}: expected topics, with commas between several, got {chosen!r}")
     return names
 
 
@@ -44,17 +45,23 @@ def is_cloud(names: tuple[str, ...]) -> Callable[[ChannelRecord, SchemaRecord], 
     return wanted
 
 
-def check_names(path: Path, names: tuple[str, ...], definitions: Definitions) -> None:
-    """EgolocError where a named topic is not in the log, or is none of point clouds."""
+def check_names(
+    path: Path,
+    names: tuple[str, ...],
+    definitions: Definitions,
+    sensor: str = LIDAR,
+    expected: Collection[str] = (POINT_CLOUD,),
+) -> None:
+    """EgolocError where a named topic is not in the log, or has none of the schemas of its sensor."""
     schemas = {c.topic: definitions.schemas.get(c.schema_id) for c in definitions.channels.values()}
     for name in names:
         if name not in schemas:
             known = ", ".join(sorted(schemas)[:20]) or "none"
-            raise EgolocError(f"{path}: topics.lidar: no topic {name}; the log has {known}")
+            raise EgolocError(f"{path}: topics.{sensor}: no topic {name}; the log has {known}")
         schema = schemas[name]
-        if schema is None or short_name(schema.name) != POINT_CLOUD:
-            found = schema.name if schema else "none"
-            raise EgolocError(f"{path}: topics.lidar: {name} has schema {found}, expected {POINT_CLOUD}")
+        if schema is None or short_name(schema.name) not in expected:
+            found, told = schema.name if schema else "none", " or ".join(sorted(expected))
+            raise EgolocError(f"{path}: topics.{sensor}: {name} has schema {found}, expected {told}")
 
 
 def check_encoding(path: Path, channel: ChannelRecord) -> None:

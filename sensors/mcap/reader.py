@@ -23,7 +23,7 @@ from sensors.mcap.gather import Gatherer
 from sensors.mcap.modes import join_modes
 from sensors.mcap.pace import HOLD_NS, Pace
 from sensors.mcap.sections import open_container
-from sensors.mcap.topics import LIDAR, PARTS, Roles, assign, check_choice, conflict, wanted_by
+from sensors.mcap.topics import FRAMES, PARTS, Roles, assign, check_choice, conflict, wanted_by
 from sensors.pieces import PIECE_S, SENSORS
 from sensors.records import LeftOut, Log
 
@@ -52,7 +52,7 @@ class LogReader:
         strict: bool = True, times: bool = False, done: Callable[[Topic, Mask], None] | None = None,
     ) -> None:  # fmt: skip
         check_choice(topics or {})
-        self.chosen = {sensor: topic for sensor, topic in (topics or {}).items() if sensor != LIDAR}
+        self.chosen = {sensor: topic for sensor, topic in (topics or {}).items() if sensor not in FRAMES}
         if not round(length_s * NS_PER_S) > 0:
             raise EgolocError(f"length of a piece: expected more than 0 s, got {length_s:g}")
         self.length_ns = round(length_s * NS_PER_S)

@@ -50,6 +50,30 @@ uint32 point_step
 uint32 row_step
 uint8[] data
 bool is_dense""",
+    "sensor_msgs/Image": """std_msgs/Header header
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data""",
+    "sensor_msgs/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data",
+    "sensor_msgs/RegionOfInterest": """uint32 x_offset
+uint32 y_offset
+uint32 height
+uint32 width
+bool do_rectify""",
+    "sensor_msgs/CameraInfo": """std_msgs/Header header
+uint32 height
+uint32 width
+string distortion_model
+float64[] d
+float64[9] k
+float64[9] r
+float64[12] p
+uint32 binning_x
+uint32 binning_y
+RegionOfInterest roi""",
     "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation",
     "geometry_msgs/TransformStamped": """std_msgs/Header header
 string child_frame_id

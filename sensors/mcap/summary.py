@@ -13,14 +13,18 @@ from sensors.mcap.assembly import METADATA, Facts
 from sensors.mcap.cdr import short_name
 from sensors.mcap.columns import Topic
 from sensors.mcap.decoded import stamps
+from sensors.mcap.image_messages import CAMERA_INFO, IMAGES
 from sensors.mcap.point_cloud import POINT_CLOUD
 from sensors.mcap.reader import LogReader
 from sensors.mcap.static_tf import TRANSFORMS
-from sensors.mcap.topics import LIDAR, Roles, conflict
+from sensors.mcap.topics import CAMERA, LIDAR, Roles, conflict
 from sensors.pieces import PIECE_S, summed
 from sensors.records import LeftOut, Log
 from sensors.steps import Steps
 from sensors.vehicle import Vehicle
+
+_FRAMES = {POINT_CLOUD: LIDAR, TRANSFORMS: LIDAR, CAMERA_INFO: CAMERA} | dict.fromkeys(IMAGES, CAMERA)
+"""Schemas that are read as frames, not as columns -> what they feed."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +118,9 @@ def _is_stamped(topic: Topic) -> bool:
 
 def _topic(topic: Topic, reader: LogReader, steps: Steps) -> TopicSummary:
     fed = tuple(s for s, source in reader.roles.sensors.items() if source is topic and reader.rows[s])
-    if topic.count and short_name(topic.schema.name) in {POINT_CLOUD, TRANSFORMS}:
-        fed = (LIDAR,)  # read as frames, not as columns
+    kind = short_name(topic.schema.name)
+    if topic.count and kind in _FRAMES:
+        fed = (_FRAMES[kind],)
     return TopicSummary(
         name=topic.name,
         schema=topic.schema.name,

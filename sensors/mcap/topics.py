@@ -30,7 +30,9 @@ BODY_FRAMES = frozenset({"body", "base_link", "base_footprint", "vehicle", "rear
 """frame_id of a twist that is a wheel speed."""
 
 LIDAR = "lidar"
-"""Key of the topics that frames are read from (``sensors.mcap.frames``), which feed no columns."""
+CAMERA = "camera"
+FRAMES = (LIDAR, CAMERA)
+"""Keys of the topics that frames are read from (``sensors.mcap.frames``), which feed no columns."""
 
 TAG_TOPICS = {"/scene": "scene", "/drive_mode": "mode"}
 """Topics of strings that are tags without being named; all other strings may be anything."""
@@ -107,7 +109,7 @@ def feeds(schema: str) -> tuple[str, ...]:
 
 def check_choice(chosen: Mapping[str, str]) -> None:
     """Raise unless every key names a sensor, or the LiDAR."""
-    known = (*SENSORS, *PARTS, LIDAR)
+    known = (*SENSORS, *PARTS, *FRAMES)
     for sensor in set(chosen) - set(known):
         raise EgolocError(f"topics.{sensor}: no such sensor, expected one of {', '.join(known)}")
 
