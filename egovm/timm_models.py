@@ -38,6 +38,19 @@ def backbone(name: str, weights: Path | None = None) -> nn.Module:
     return found
 
 
+def normalization(name: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Mean and standard deviation of red, green and blue (0..1) that a backbone's images are brought from.
+
+    Raises EgolocError for a name that timm does not know.
+    """
+    timm = _timm()
+    if not timm.is_model(name):
+        raise EgolocError(f"camera: backbone: expected a model of timm {timm.__version__}, got {name!r}")
+    # a model without pretrained weights has no entry
+    known = timm.get_pretrained_cfg(name) or timm.models.PretrainedCfg()
+    return tuple(known.mean), tuple(known.std)
+
+
 def _from_file(timm: ModuleType, name: str, weights: Path) -> dict[str, Any]:
     """What makes timm read the file. timm takes any: one in which something of the backbone is missing raises."""
     if not weights.is_file():

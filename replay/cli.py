@@ -12,6 +12,7 @@ import tyro
 from replay.commands.benchmarks import BENCHMARKS
 from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
+from replay.commands.frames import Frames
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
 from replay.commands.map_check import CheckMap
@@ -31,6 +32,7 @@ COMMANDS = {
     "score": Score,
     "compare": Compare,
     "view": View,
+    "frames": Frames,
     "allan": Allan,
     "noise": Noise,
 }

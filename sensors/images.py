@@ -92,7 +92,8 @@ class Image:
     @cached_property
     def T_camera_body(self) -> Floats:  # noqa: N802
         """(4, 4)."""
-        return np.linalg.inv(self.T_body_camera)
+        inverse: Floats = np.linalg.inv(self.T_body_camera)
+        return inverse
 
     def rgb(self) -> NDArray[np.uint8]:
         """(height, width, 3) decoded; EgolocError where data are no such image."""
@@ -141,9 +142,10 @@ def format_of(data: bytes) -> ImageFormat | None:
 def _opened(data: bytes, name: str) -> "Opened":
     """The image, of which only the head has been read."""
     from PIL import Image as Pillow
+    from PIL import UnidentifiedImageError
 
     try:
         return Pillow.open(io.BytesIO(data), formats=("JPEG", "PNG"))
     except (OSError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
-        told = "expected a JPEG or PNG" if isinstance(error, Pillow.UnidentifiedImageError) else str(error)
+        told = "expected a JPEG or PNG" if isinstance(error, UnidentifiedImageError) else str(error)
         raise EgolocError(f"image of {name}: {told}") from None

@@ -6,7 +6,7 @@ the vehicle was, its cameras, and its sweep. The tables of the nuScenes devkit i
 The body is nuScenes' ego vehicle (forward-left-up, under the middle of the rear axle on the ground). A sweep's stamp is
 the end of its turn; nuScenes says that its points are compensated to it, which the images bear out (docs/datasets.md).
 ``cam2ego`` is the camera's place on the body. ``lidar2cam`` also holds how the vehicle moved from the camera's exposure
-to the sweep's stamp, so that its poses at every exposure can be had: they are the reference, some ten each keyframe.
+to the sweep's stamp, so that its poses at every exposure can be had: they are the reference, seven for each keyframe.
 Its positions are those of the place's own map, which the file does not name, with heights of 0: no map frame.
 """
 

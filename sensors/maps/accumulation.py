@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -74,7 +74,7 @@ class Accumulation:
     def pose(self, t_ns: int) -> Floats:
         """(4, 4) T_map_body at one moment."""
         corners = np.concatenate((np.zeros((1, 3)), np.eye(3)))
-        at = self._place(corners, t_ns, np.zeros(4, np.int32))
+        at = self.place(corners, t_ns, np.zeros(4, np.int32))
         T = np.eye(4)
         T[:3, 3] = at[0]
         T[:3, :3] = (at[1:] - at[0]).T
@@ -87,10 +87,14 @@ class Accumulation:
         last = frame.t_ns + max((int(offset.max()) for offset in offsets), default=0)
         if min(first, frame.t_ns) < self.t_ns[0] or max(last, frame.t_ns) > self.t_ns[-1]:
             return "outside of the trajectory"
-        left = max(int(np.searchsorted(self.t_ns, min(first, frame.t_ns), side="right")) - 1, 0)
-        right = int(np.searchsorted(self.t_ns, max(last, frame.t_ns), side="left"))
-        widest = np.diff(self.t_ns[left : right + 1]).max(initial=0)
+        widest = self.widest(min(first, frame.t_ns), max(last, frame.t_ns))
         return "in a gap of the trajectory" if widest > self.gap_ns else None
+
+    def widest(self, first_ns: int, last_ns: int) -> int:
+        """The longest pause of the trajectory from first_ns to last_ns, ns."""
+        left = max(int(np.searchsorted(self.t_ns, first_ns, side="right")) - 1, 0)
+        right = int(np.searchsorted(self.t_ns, last_ns, side="left"))
+        return int(np.diff(self.t_ns[left : right + 1]).max(initial=0))
 
     def _in_map(self, frame: Frame) -> Floats:
         parts = []
@@ -100,10 +104,11 @@ class Accumulation:
             own = ((body >= self.reach.vehicle_min) & (body <= self.reach.vehicle_max)).all(axis=1)
             near = (distance >= self.reach.min_range_m) & (distance <= self.reach.max_range_m) & ~own
             offset = sweep.offset_ns[near] * np.int32(not sweep.compensated)
-            parts.append(self._place(body[near], frame.t_ns, offset))
+            parts.append(self.place(body[near], frame.t_ns, offset))
         return np.concatenate(parts) if parts else np.empty((0, 3))
 
-    def _place(self, body: Floats, t_ns: int, offset_ns: NDArray[np.int32]) -> Floats:
+    def place(self, body: Floats, t_ns: int, offset_ns: NDArray[Any]) -> Floats:
+        """(N, 3) m in the map of places (N, 3) in body axes, each at t_ns + offset_ns (N,)."""
         out = np.empty((len(body), 3))
         place_points(np.ascontiguousarray(body), t_ns, offset_ns, self.t_ns, self.p, self.R, self.turn, out)
         return out

@@ -1,0 +1,115 @@
+"""Frames of a log as the network takes them: points and images in body axes at the frame's own time.
+
+Points are brought to the frame's time by the vehicle's motion. An image stays as it was taken: the camera's pose is
+that of its exposure, told from the body at the frame's time, so that what stands is found where it appears. Images are
+rectified, resized (both axes by themselves; intrinsics follow) and normalized as the backbone was trained.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from egovm.batch import Images, Points
+from egovm.config import BevConfig, CameraConfig, NetworkConfig
+from egovm.timm_models import normalization
+from sensors.errors import EgolocError
+from sensors.frames import Frame
+from sensors.images import Image
+from sensors.motion import Motion, Standing, points_at, relative, span_of
+
+Floats = NDArray[np.float64]
+
+FULL_INTENSITY = 255.0
+"""What LiDARs give at most (nuScenes, Argoverse 2, our simulation); more is cut off."""
+
+
+class FrameInputs(NamedTuple):
+    """What a network takes of B frames; None where it has no encoder for it, or no frame has any."""
+
+    points: Points | None
+    images: Images | None
+
+
+def frame_inputs(
+    frames: Sequence[Frame], config: NetworkConfig, motions: Sequence[Motion] | None = None
+) -> FrameInputs:
+    """Frames for a network, one batch. motions: of each frame; None: the vehicle stood.
+
+    Cameras go by name, in the order in which they first appear; where a frame lacks one, its image is not valid.
+    Raises EgolocError for no frames, a motion that does not cover its frame, and images that cannot be decoded.
+    """
+    moved = [Standing()] * len(frames) if motions is None else motions
+    if not frames or len(moved) != len(frames):
+        raise EgolocError(f"frames: expected one or more and a motion for each, got {len(frames)} and {len(moved)}")
+    for frame, motion in zip(frames, moved, strict=True):
+        first, last = span_of(frame)
+        if not motion.covers(first, last):
+            raise EgolocError(f"frame at {frame.t_ns}: expected a motion known from {first} to {last} ns")
+    points = images = None
+    if config.lidar is not None and any(frame.sweeps for frame in frames):
+        points = lidar_points(frames, config.bev, moved)
+    if config.camera is not None and any(frame.images for frame in frames):
+        images = camera_images(frames, config.camera, moved)
+    return FrameInputs(points, images)
+
+
+def lidar_points(frames: Sequence[Frame], bev: BevConfig, motions: Sequence[Motion]) -> Points:
+    """The points over the BEV plane, at the heights that are used, of all sweeps."""
+    parts = [_points(frame, bev, motion) for frame, motion in zip(frames, motions, strict=True)]
+    rows = torch.from_numpy(np.concatenate(parts).astype(np.float32))
+    which = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor([len(part) for part in parts]))
+    return Points(rows[:, :3], rows[:, 3], rows[:, 4], which, len(parts))
+
+
+def _points(frame: Frame, bev: BevConfig, motion: Motion) -> Floats:
+    """(P, 5) x y z m, intensity 0..1 and s from the frame's time, of one frame."""
+    found = [np.empty((0, 5))]
+    for sweep in frame.sweeps:
+        xyz = points_at(sweep, frame.t_ns, motion, frame.t_ns)
+        intensity = np.clip(np.nan_to_num(sweep.intensity.astype(np.float64)) / FULL_INTENSITY, 0.0, 1.0)
+        rows = np.column_stack((xyz, intensity, sweep.offset_ns * 1e-9))
+        low, high = bev.z_m
+        on_plane = (np.abs(xyz[:, :2]) < bev.half_m).all(axis=1)
+        found.append(rows[on_plane & (xyz[:, 2] >= low) & (xyz[:, 2] < high)])
+    return np.concatenate(found)
+
+
+def camera_images(frames: Sequence[Frame], camera: CameraConfig, motions: Sequence[Motion]) -> Images:
+    """The images of all cameras."""
+    names = list(dict.fromkeys(image.name for frame in frames for image in frame.images))
+    shape = len(frames), len(names)
+    height, width = camera.image_hw
+    rgb = torch.zeros(*shape, 3, height, width)
+    K, T = torch.eye(3).repeat(*shape, 1, 1), torch.eye(4).repeat(*shape, 1, 1)
+    valid = torch.zeros(shape, dtype=torch.bool)
+    mean, deviation = (torch.tensor(values)[:, None, None] for values in normalization(camera.backbone))
+    for b, (frame, motion) in enumerate(zip(frames, motions, strict=True)):
+        for image in frame.images:
+            n = names.index(image.name)
+            rgb[b, n] = (_pixels(image, height, width) - mean) / deviation
+            K[b, n] = torch.from_numpy(_scaled(image, height, width))
+            T[b, n] = torch.from_numpy(image.T_camera_body @ relative(motion, frame.t_ns, image.t_ns))
+            valid[b, n] = True
+    return Images(rgb, K, T, valid)
+
+
+def _pixels(image: Image, height: int, width: int) -> Tensor:
+    """(3, height, width) 0..1, every pixel the mean of those that it stands for."""
+    from PIL import Image as Pillow
+
+    small = Pillow.fromarray(image.rectified()).resize((width, height), Pillow.Resampling.BILINEAR)
+    return torch.from_numpy(np.array(small)).permute(2, 0, 1) / 255.0
+
+
+def _scaled(image: Image, height: int, width: int) -> Floats:
+    """(3, 3) intrinsics of the resized image; a whole number is the middle of a pixel before and after."""
+    across, down = width / image.width, height / image.height
+    K = image.K.copy()
+    K[:2, 2] += 0.5
+    K[:2] *= np.array([[across], [down]])
+    K[:2, 2] -= 0.5
+    return K
