@@ -56,7 +56,7 @@ def _motion(path: Path, topics: Mapping[str, str], frames: list[Frame]) -> Motio
     begin_ns, end_ns = frames[0].t_ns - AROUND_NS, frames[-1].t_ns + AROUND_NS
     near: list[Trajectory] = []
     arm: Vector3 = (0.0, 0.0, 0.0)
-    for reference, arm in _references(path, topics):
+    for reference, arm in _references(path, topics):  # noqa: B007 (the last one serves for all)
         rows = reference[(reference.t_ns >= begin_ns) & (reference.t_ns <= end_ns)]
         near += [rows] if len(rows) else []
         if len(reference) and reference.t_ns[-1] > end_ns:

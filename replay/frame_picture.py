@@ -68,7 +68,7 @@ def draw_frame(chosen: ChosenFrame, path: Path) -> None:
     rows = around(chosen.frame.images)
     columns = max(map(len, rows))
     aspect = max(image.height / image.width for image in chosen.frame.images)
-    figure = Figure(figsize=(PANEL_IN * columns, (PANEL_IN * aspect + 0.3) * len(rows) + 0.9), layout="constrained")
+    figure = Figure(figsize=(PANEL_IN * columns, (PANEL_IN * aspect + 0.1) * len(rows) + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for axes in grid.flat:
@@ -90,7 +90,7 @@ def _panel(axes: Any, chosen: ChosenFrame, image: Image) -> None:
     seen = on_image(chosen, image)
     far_first = np.argsort(-seen.depth, kind="stable")
     axes.scatter(
-        *seen.pixels[far_first].T, c=colours(seen.depth[far_first]), s=1.6, marker="o", linewidths=0, alpha=0.85
+        *seen.pixels[far_first].T, c=colours(seen.depth[far_first]), s=3.0, marker="o", linewidths=0, alpha=0.85
     )
     axes.set(xlim=(-0.5, image.width - 0.5), ylim=(image.height - 0.5, -0.5))
     late_ms = (image.t_ns - chosen.frame.t_ns) / 1e6

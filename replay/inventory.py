@@ -12,6 +12,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from replay.camera_inventory import camera_text, file_cameras
 from replay.lidar_inventory import file_lidars, frames_text, lidar_text
 from replay.plausibility import ImuWatch
 from replay.references import GAP_NS, GAP_PERIODS
@@ -172,6 +173,7 @@ def file_inventory(path: Path, topics: Mapping[str, str]) -> dict[str, Any]:
         found = inventory(known, str(path)) | {"remarks": [f"Not to be replayed as it is: {summary.conflict}."]}
     found["topics"] = [_topic(topic) for topic in summary.topics]
     found["lidars"] = file_lidars(path, topics, found["topics"])
+    found["cameras"] = file_cameras(path, topics, found["topics"])
     found["file"] = {
         "bytes": summary.size_bytes,
         "complete": summary.complete,
@@ -230,6 +232,8 @@ def print_inventory(found: Mapping[str, Any]) -> None:
         console.print(f"Pose fixes: {found['two_modes']} tell two modes of their posterior")
     for lidar in found.get("lidars", ()):
         console.print(lidar_text(lidar))
+    for camera in found.get("cameras", ()):
+        console.print(camera_text(camera))
     if found.get("frames"):
         console.print(frames_text(found["frames"]))
     for kind, label in (("scene_s", "Scene"), ("mode_s", "Drive mode")):

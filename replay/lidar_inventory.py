@@ -1,5 +1,6 @@
 """What a log holds of LiDAR frames, counted on the way or looked up in a file."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ class FrameCount:
     def __init__(self) -> None:
         self._steps = Steps()
         self._points: list[int] = []
+        self._images: Counter[str] = Counter()
 
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The frames, counted."""
@@ -26,14 +28,20 @@ class FrameCount:
             self._points += [0] * (len(lidars) - len(self._points))
             for number, count in enumerate(lidars):
                 self._points[number] += count
+            self._images.update(image.name for image in frame.images)
             yield frame
 
     def found(self) -> dict[str, Any] | None:
-        """Frames, rate, and mean points of each LiDAR, JSON-ready; None where there were no frames."""
+        """Frames, rate, mean points of each LiDAR, images of each camera, JSON-ready; None where there are no frames."""
         count = self._steps.count
         if not count:
             return None
-        return {"frames": count, "rate_hz": self._steps.rate_hz(), "points": [round(n / count) for n in self._points]}
+        return {
+            "frames": count,
+            "rate_hz": self._steps.rate_hz(),
+            "points": [round(n / count) for n in self._points],
+            "images": dict(self._images),
+        }
 
 
 def file_lidars(path: Path, topics: Mapping[str, str], found: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -51,7 +59,14 @@ def file_lidars(path: Path, topics: Mapping[str, str], found: list[dict[str, Any
 def frames_text(frames: Mapping[str, Any]) -> str:
     """What was written of frames."""
     rate = "" if frames["rate_hz"] is None else f" at {frames['rate_hz']:.1f} Hz"
-    return f"LiDAR: {frames['frames']} frames{rate}, points in each: {' and '.join(str(n) for n in frames['points'])}."
+    found = f"{frames['frames']} frames{rate}"
+    told = []
+    if frames["points"]:
+        told.append(f"LiDAR: {found}, points in each: {' and '.join(str(n) for n in frames['points'])}.")
+    if frames["images"]:
+        cameras = ", ".join(f"{count} of {name}" for name, count in frames["images"].items())
+        told.append(f"Cameras: {found}, images: {cameras}.")
+    return " ".join(told) or f"{found}, all empty."
 
 
 def lidar_text(lidar: Mapping[str, Any]) -> str:

@@ -92,8 +92,10 @@ class Image:
     @cached_property
     def T_camera_body(self) -> Floats:  # noqa: N802
         """(4, 4)."""
-        inverse: Floats = np.linalg.inv(self.T_body_camera)
-        return inverse
+        R, p = self.T_body_camera[:3, :3].T, self.T_body_camera[:3, 3]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, -R @ p
+        return T
 
     def rgb(self) -> NDArray[np.uint8]:
         """(height, width, 3) decoded; EgolocError where data are no such image."""

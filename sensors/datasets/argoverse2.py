@@ -1,4 +1,4 @@
-"""Argoverse 2 sensor and LiDAR logs: a folder with city_SE3_egovehicle.feather, calibration/, sensors/lidar/ and map/.
+"""Argoverse 2 sensor and LiDAR logs: a folder with city_SE3_egovehicle.feather, calibration/, sensors/ and map/.
 
 The ego vehicle's axes are forward-left-up with the origin in the middle of the rear axle; they become the body. Its
 poses in city coordinates become the reference, in the city's UTM frame (``sensors.maps.argoverse2``); heights keep the
@@ -17,13 +17,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
-from pyarrow import feather
 
+from sensors.datasets.argoverse2_cameras import CameraFolder
+from sensors.datasets.feather_table import column, columns, stamps, table
 from sensors.errors import EgolocError
 from sensors.frames import Frame, Sweep
 from sensors.geodesy import MapFrame
+from sensors.images import Image
 from sensors.maps.argoverse2 import city_frame
 from sensors.records import LeftOut, Log, Trajectory
 from sensors.rotation import matrix_from_q
@@ -53,8 +54,8 @@ def load(src: Path) -> Log:
     if not src.is_dir():
         raise EgolocError(f"{src}: expected the folder of an Argoverse 2 log")
     path = src / POSES
-    table = _table(path, ("timestamp_ns", *_QUATERNION, *_PLACE))
-    t_ns, q, p = _stamps(path, table), _columns(path, table, _QUATERNION), _columns(path, table, _PLACE)
+    read = table(path, ("timestamp_ns", *_QUATERNION, *_PLACE))
+    t_ns, q, p = stamps(path, read), columns(path, read, _QUATERNION), columns(path, read, _PLACE)
     again = np.zeros(len(t_ns), bool)
     again[1:] = (np.diff(t_ns) >= 0) & (np.diff(t_ns) < SAME_POSE_NS)
     sound = {"not finite": np.isfinite(p).all(axis=1), "no rotation": np.abs(np.linalg.norm(q, axis=1) - 1.0) < 1e-3}
@@ -68,19 +69,23 @@ def load(src: Path) -> Log:
 
 
 def frames(src: Path) -> Iterator[Frame]:
-    """The LiDAR sweeps of a log's folder by time, each read when its turn comes; they arrive with their last point."""
+    """The LiDAR sweeps of a log's folder by time, with the images near each, read when its turn comes.
+
+    A frame arrives with its last point or image.
+    """
     paths = sorted((_stamp_of(path), path) for path in (src / SWEEPS).glob("*.feather"))
     if not paths:
         return
     mounted = _extrinsics(src / CALIBRATION)
-    for t_ns, path in paths:
-        yield _frame(path, t_ns, mounted)
+    cameras = CameraFolder(src, np.array([t_ns for t_ns, _ in paths], np.int64))
+    for number, (t_ns, path) in enumerate(paths):
+        yield _frame(path, t_ns, mounted, cameras.images(number))
 
 
-def _frame(path: Path, t_ns: int, mounted: Sequence[Floats]) -> Frame:
-    table = _table(path, _POINT)
-    xyz = _columns(path, table, ("x", "y", "z"))
-    intensity, laser, offset_ns = (_column(path, table, name) for name in _POINT[3:])
+def _frame(path: Path, t_ns: int, mounted: Sequence[Floats], images: tuple[Image, ...]) -> Frame:
+    read = table(path, _POINT)
+    xyz = columns(path, read, ("x", "y", "z"))
+    intensity, laser, offset_ns = (column(path, read, name) for name in _POINT[3:])
     if laser.dtype.kind not in "iu" or offset_ns.dtype.kind not in "iu":
         raise EgolocError(
             f"{path}: laser_number, offset_ns: expected integers, got {laser.dtype} and {offset_ns.dtype}"
@@ -97,7 +102,8 @@ def _frame(path: Path, t_ns: int, mounted: Sequence[Floats]) -> Frame:
         mine = usable & (laser // LASERS == number)
         seen = ((xyz[mine] - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
         sweeps.append(Sweep(seen, T, offset_ns[mine], intensity[mine], laser[mine] % LASERS, compensated=True))
-    return Frame(t_ns, t_ns + int(offset_ns.max(initial=0)), tuple(sweeps))
+    arrival_ns = max([t_ns + int(offset_ns.max(initial=0)), *(image.t_ns for image in images)])
+    return Frame(t_ns, arrival_ns, tuple(sweeps), images)
 
 
 def _stamp_of(path: Path) -> int:
@@ -108,9 +114,9 @@ def _stamp_of(path: Path) -> int:
 
 def _extrinsics(path: Path) -> list[Floats]:
     """(4, 4) T_body_lidar of both LiDARs."""
-    table = _table(path, ("sensor_name", *_QUATERNION, *_PLACE))
-    names = table["sensor_name"].to_pylist()
-    q, p = _columns(path, table, _QUATERNION), _columns(path, table, _PLACE)
+    read = table(path, ("sensor_name", *_QUATERNION, *_PLACE))
+    names = read["sensor_name"].to_pylist()
+    q, p = columns(path, read, _QUATERNION), columns(path, read, _PLACE)
     found = []
     for name in LIDARS:
         if names.count(name) != 1:
@@ -128,34 +134,3 @@ def _map_frame(src: Path) -> MapFrame | None:
     """The frame of the city that a map's file names."""
     named = (city_frame(path) for path in sorted((src / "map").glob("*")))
     return next((frame for frame in named if frame is not None), None)
-
-
-def _table(path: Path, wanted: Sequence[str]) -> pa.Table:
-    """A feather file's wanted columns."""
-    try:
-        table = feather.read_table(path, memory_map=False)
-    except (OSError, pa.ArrowException) as error:
-        raise EgolocError(f"{path}: expected a feather file: {str(error).splitlines()[0]}") from None
-    if missing := [name for name in wanted if name not in table.column_names]:
-        raise EgolocError(f"{path}: column {missing[0]}: not there, the file has {', '.join(table.column_names)}")
-    return table
-
-
-def _column(path: Path, table: pa.Table, name: str) -> NDArray[np.generic]:
-    """A column of numbers, (N,)."""
-    values: NDArray[np.generic] = table[name].to_numpy()
-    if values.dtype.kind not in "fiu" or table[name].null_count:
-        raise EgolocError(f"{path}: column {name}: expected numbers, got {table.schema.field(name).type}")
-    return values
-
-
-def _columns(path: Path, table: pa.Table, names: Sequence[str]) -> Floats:
-    """(N, len(names)) float64."""
-    return np.stack([_column(path, table, name).astype(np.float64) for name in names], axis=1)
-
-
-def _stamps(path: Path, table: pa.Table) -> NDArray[np.int64]:
-    values = _column(path, table, "timestamp_ns")
-    if values.dtype.kind not in "iu":
-        raise EgolocError(f"{path}: column timestamp_ns: expected integers, got {values.dtype}")
-    return values.astype(np.int64)

@@ -49,6 +49,10 @@ class MessageWalk:
         slots = [int(self._slot_of[channel]) for channel in entry.indexes]
         return not slots or any(slot != -2 for slot in slots)
 
+    def wants(self, identifier: int) -> bool:
+        """Whether a channel that is known is wanted."""
+        return int(self._slot_of[identifier]) >= 0
+
     def messages(self, skip: Callable[[ChunkEntry], bool] = lambda _: False) -> Iterator[SingleMessage]:
         """The wanted messages in order of log time, as far as the summary tells. skip: chunks that are passed over."""
         for section in self.source.sections(lambda entry: not self.holds(entry) or skip(entry), lambda _: None):

@@ -11,7 +11,17 @@ from sensors.errors import EgolocError
 
 
 def test_the_formats_are_those_of_the_command_line() -> None:
-    assert set(FORMATS) == {"rtklib", "imu-gnss-drive", "comma2k19", "rosbag", "novatel", "gtsam-kitti", "argoverse2"}
+    known = {
+        "rtklib",
+        "imu-gnss-drive",
+        "comma2k19",
+        "rosbag",
+        "novatel",
+        "gtsam-kitti",
+        "argoverse2",
+        "nuscenes-frame",
+    }
+    assert set(FORMATS) == known
 
 
 def test_no_importer_is_loaded_before_it_is_asked_for() -> None:
