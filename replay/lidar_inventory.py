@@ -32,7 +32,7 @@ class FrameCount:
             yield frame
 
     def found(self) -> dict[str, Any] | None:
-        """Frames, rate, mean points of each LiDAR, images of each camera, JSON-ready; None where there are no frames."""
+        """Frames, rate, mean points of each LiDAR, images of each camera. JSON-ready; None without frames."""
         count = self._steps.count
         if not count:
             return None

@@ -25,7 +25,8 @@ def encoded(rgb: NDArray[np.uint8], kind: ImageFormat) -> bytes:
     if kind in RAW:
         return {"rgb8": rgb, "bgr8": rgb[..., ::-1], "mono8": rgb[..., 0]}[kind].tobytes()
     stream = io.BytesIO()
-    Pillow.fromarray(rgb).save(stream, kind)
+    options = {"quality": 95, "subsampling": 0} if kind == "jpeg" else {}
+    Pillow.fromarray(rgb).save(stream, kind, **options)
     return stream.getvalue()
 
 

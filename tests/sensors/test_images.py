@@ -61,7 +61,7 @@ def test_what_a_polynomial_folds_back_is_not_seen() -> None:
     """r (1 - 0.28 r^2) turns back at r = 1 / sqrt(0.84): further aside it would appear within the image again."""
     d = np.array([-0.28, 0.0, 0.0, 0.0])
     assert widest("plumb_bob", d) == pytest.approx(1.0 / math.sqrt(0.84), abs=0.01)
-    found, seen = pixels_of(np.array([[1.0, 0.0, 1.0], [1.8, 0.0, 1.0]]), K, "plumb_bob", d)
+    _, seen = pixels_of(np.array([[1.0, 0.0, 1.0], [1.8, 0.0, 1.0]]), K, "plumb_bob", d)
     assert seen.tolist() == [True, False]
     assert 320.0 + 1000.0 * 1.8 * (1.0 - 0.28 * 1.8**2) < 640.0
 
@@ -126,6 +126,6 @@ def test_images_that_are_none(changed: dict[str, object], told: str) -> None:
 
 
 def test_a_frame_has_one_image_of_each_camera() -> None:
-    with pytest.raises(EgolocError, match="Frame.images: expected one of each camera, got front, front"):
+    with pytest.raises(EgolocError, match=r"Frame\.images: expected one of each camera, got front, front"):
         Frame(0, 0, (), (image(0), image(1)))
     assert set(COEFFICIENTS) == {"none", *BENT}

@@ -20,7 +20,7 @@ def circle(rate: float = 0.5, speed: float = 10.0, count: int = 400) -> Trajecto
     angle = rate * (t_ns - T0) * 1e-9
     radius = speed / rate
     p = np.column_stack((radius * np.sin(angle), radius * (1.0 - np.cos(angle)), 0.0 * angle))
-    return Trajectory(t_ns, t_ns, p + (4e5, 5e6, 300.0), q_from_rpy(0.0, 0.0, angle))
+    return Trajectory(t_ns, t_ns, p + np.array([4e5, 5e6, 300.0]), q_from_rpy(0.0, 0.0, angle))
 
 
 def test_constant_velocity_is_the_exponential_of_its_twist() -> None:
