@@ -179,8 +179,7 @@ def test_calibrations_that_are_none(copied: Path, path: tuple[str, ...], value: 
         at[path[-1]] = value
     file.write_text(json.dumps(content))
     with pytest.raises(EgolocError, match=told) as raised:
-        load("nuscenes-frame", copied)
-        list(frames("nuscenes-frame", copied))
+        (load("nuscenes-frame", copied), list(frames("nuscenes-frame", copied)))
     assert "\n" not in str(raised.value)
 
 
@@ -198,7 +197,7 @@ def test_sweeps_and_files_that_are_none(copied: Path) -> None:
     with pytest.raises(EgolocError, match="data_list: expected a list of keyframes, got NoneType"):
         load("nuscenes-frame", copied)
     (copied / "calibration.json").write_text("{")
-    with pytest.raises(EgolocError, match="calibration.json: expected JSON"):
+    with pytest.raises(EgolocError, match=r"calibration\.json: expected JSON"):
         load("nuscenes-frame", copied)
-    with pytest.raises(EgolocError, match="expected a folder with calibration.json"):
+    with pytest.raises(EgolocError, match=r"expected a folder with calibration\.json"):
         load("nuscenes-frame", copied / "calibration.json")

@@ -145,7 +145,7 @@ def test_of_several_topics_of_a_camera_one_is_read(save: Save) -> None:
         ([static(), compressed()], "no CameraInfo on /front/camera_info"),
         ([info(), compressed()], "no /tf_static leads from base_link to 'optical'"),
         ([static(), info(k=[0.0] * 9), compressed()], "/front/camera_info: CameraInfo: the camera is not calibrated"),
-        ([static(), info(distortion_model="ds"), compressed()], "expected distortion_model none, plumb_bob.*, got 'ds'"),
+        ([static(), info(distortion_model="ds"), compressed()], "expected distortion_model none, .*, got 'ds'"),
         ([static(), info(d=[0.1] * 7), compressed()], "Image.distortion: expected 4 or 5 numbers for plumb_bob, got 7"),
         ([static(), info(width=128), compressed()], "another size than their CameraInfo says: 128 x 48 pixels"),
         ([static(), info(), compressed(data=b"abc")], "expected images as JPEG or PNG, got format 'rgb8; jpeg"),
