@@ -98,11 +98,8 @@ def camera_images(frames: Sequence[Frame], camera: CameraConfig, motions: Sequen
 
 
 def _pixels(image: Image, height: int, width: int) -> Tensor:
-    """(3, height, width) 0..1, every pixel the mean of those that it stands for."""
-    from PIL import Image as Pillow
-
-    small = Pillow.fromarray(image.rectified()).resize((width, height), Pillow.Resampling.BILINEAR)
-    return torch.from_numpy(np.array(small)).permute(2, 0, 1) / 255.0
+    """(3, height, width) 0..1."""
+    return torch.from_numpy(image.small(width, height).copy()).permute(2, 0, 1) / 255.0
 
 
 def _scaled(image: Image, height: int, width: int) -> Floats:

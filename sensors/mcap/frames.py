@@ -24,7 +24,7 @@ from sensors.mcap.camera_topics import Cameras, NoCameraError, is_image
 from sensors.mcap.cdr import MalformedMessageError, short_name
 from sensors.mcap.container import ChannelRecord, ChunkEntry, SchemaRecord
 from sensors.mcap.frame_grouping import Seen, grouped, in_order
-from sensors.mcap.image_messages import IMAGES, stamp_of
+from sensors.mcap.image_messages import IMAGES, frame_of, stamp_of
 from sensors.mcap.lidar_topics import (
     WORLD_FRAMES,
     check_encoding,
@@ -131,11 +131,16 @@ class FrameReader:
         check_names(self.path, self.camera_names, self.walk.definitions, CAMERA, IMAGES)
 
     def _has_lidar(self) -> bool:
-        """Whether there is a sweep in the file. Without images nobody asks."""
+        """Whether there is a sweep in the file, by the first cloud of each topic. Without images nobody asks."""
         if not self.images:
             return True
-        walk = MessageWalk(open_container(self.path), is_cloud(self.names))
-        return next(walk.messages(), None) is not None
+        in_world: set[str] = set()
+        for message in MessageWalk(open_container(self.path), is_cloud(self.names)).messages():
+            if message.channel.topic not in in_world:
+                if self.names or frame_of(message.data) not in WORLD_FRAMES:
+                    return True
+                in_world.add(message.channel.topic)
+        return False
 
     def _leave_out(self, topic: str, reason: str) -> None:
         self._left_out[topic, reason] += 1

@@ -74,6 +74,16 @@ def stamp_of(data: memoryview) -> int:
     return sec * NS_PER_S + nanosec
 
 
+def frame_of(data: memoryview) -> str | None:
+    """frame_id of any message that begins with a header; None where it is damaged."""
+    try:
+        message = MessageReader(data)
+        message.number("i"), message.number("I")
+        return message.text().lstrip("/")
+    except MalformedMessageError:
+        return None
+
+
 def encode_image(image: Image, frame: str) -> tuple[str, bytes]:
     """Schema and message of an image."""
     out = _with_header(image.t_ns, frame)

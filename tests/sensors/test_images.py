@@ -90,6 +90,26 @@ def test_formats_are_decoded_as_they_were() -> None:
     assert np.abs(image(0, kind="jpeg").rgb().astype(int) - rgb).mean() < 4.0
 
 
+@pytest.mark.parametrize("size", [(400, 300), (333, 211), (97, 71)])
+def test_a_small_jpeg_shows_the_same_places(size: tuple[int, int]) -> None:
+    """Of a width and height that no power of two divides: decoded small and decoded whole are less than 0.05 pixels of
+    the small image apart (the shift that explains their difference best), and a pixel is the mean of those it covers.
+    """
+    width, height = 1003, 701
+    rgb = pixels(width, height)
+    given = {"width": width, "height": height}
+    found = image(0, data=encoded(rgb, "jpeg"), **given).small(*size).astype(float)
+    whole = image(0, kind="rgb8", data=rgb.tobytes(), **given).small(*size).astype(float)
+    assert found.shape == (size[1], size[0], 3)
+    slopes = np.stack([np.gradient(whole, axis=axis).ravel() for axis in (0, 1)], axis=-1)
+    shift = np.linalg.lstsq(slopes, (whole - found).ravel(), rcond=None)[0]
+    assert np.abs(shift).max() < 0.05
+    assert np.abs(found - whole).mean() < 2.0
+    u, v = size[0] // 2, size[1] // 3
+    row, column = ((v + 0.5) * height / size[1] - 0.5), ((u + 0.5) * width / size[0] - 0.5)
+    np.testing.assert_allclose(whole[v, u], rgb[round(row), round(column)], rtol=0, atol=4.0)
+
+
 def test_images_that_cannot_be_decoded() -> None:
     with pytest.raises(EgolocError, match="image of front: expected 65 x 48 pixels, got 64 x 48"):
         image(0, width=65).rgb()

@@ -171,3 +171,12 @@ def test_without_an_index_images_come_back_too(save: Save) -> None:
     frame, left_out = read(save([compressed(), info(), static()], use_chunking=False))
     assert frame is not None
     assert ([image.name for image in frame.images], left_out) == (["front"], {})
+
+
+def test_a_map_of_points_is_no_sweep(save: Save) -> None:
+    """Clouds in map axes do not keep images from being frames of their own."""
+    cloud = cloud_value(points_of([[1, 2, 3]]), START_NS - 10**9, "map")
+    path = save([static(), info(), Sent("/map", "sensor_msgs/PointCloud2", cloud, START_NS), compressed()])
+    frame, left_out = read(path)
+    assert frame is not None
+    assert (frame.t_ns, frame.sweeps, len(frame.images), list(left_out)) == (START_NS, (), 1, ["/map"])
