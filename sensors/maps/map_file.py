@@ -63,9 +63,12 @@ class MapFile:
         In the order of the file. Raises EgolocError where the file turns out to be damaged.
         """
         near = [self._tile(int(number)) for number in np.flatnonzero(_within(self.boxes, x, y, radius))]
-        elements = [tile.elements.chosen(_within(tile.boxes, x, y, radius)) for tile in near]
-        surfels = [tile.surfels.chosen(_closer(tile.surfels.p, x, y, radius)) for tile in near]
-        return joined_elements(elements), joined_surfels(surfels)
+        elements = [(tile.elements, np.flatnonzero(_within(tile.boxes, x, y, radius))) for tile in near]
+        surfels = [(tile.surfels, _closer(tile.surfels.p, x, y, radius)) for tile in near]
+        return (
+            joined_elements([part.chosen(rows) for part, rows in elements if len(rows)]),
+            joined_surfels([part.chosen(rows) for part, rows in surfels if len(rows)]),
+        )
 
     def whole(self) -> VectorMap:
         """All of it, tile by tile; none is kept."""
@@ -119,6 +122,8 @@ class MapFile:
             sources = len(self.facts.sources)
             if len(elements) and not (elements.source.min() >= 0 and elements.source.max() < sources):
                 raise EgolocError(f"source: expected 0..{sources - 1}, got {elements.source.max()}")
+            if (np.diff(surfels.p[:, 0]) < 0.0).any():
+                raise EgolocError("x: expected surfels by rising x")
         except EgolocError as error:
             raise EgolocError(f"{self.path}: tile {number}: {error}") from None
         except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
@@ -182,7 +187,9 @@ def _within(boxes: Floats, x: float, y: float, radius: float) -> NDArray[np.bool
     return near
 
 
-def _closer(p: Floats, x: float, y: float, radius: float) -> NDArray[np.bool_]:
-    dx, dy = p[:, 0] - x, p[:, 1] - y
-    near: NDArray[np.bool_] = dx * dx + dy * dy <= radius * radius
+def _closer(p: Floats, x: float, y: float, radius: float) -> NDArray[np.int64]:
+    """Rows of the places (K, 2), which rise in x, that lie within radius of a place."""
+    first, last = np.searchsorted(p[:, 0], (x - radius, x + radius))
+    dx, dy = p[first:last, 0] - x, p[first:last, 1] - y
+    near: NDArray[np.int64] = first + np.flatnonzero(dx * dx + dy * dy <= radius * radius)
     return near

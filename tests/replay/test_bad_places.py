@@ -66,7 +66,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
         ("[vehicle.imu]\nbias_time_constant_s = 0", "vehicle.imu.bias_time_constant_s: expected `float` > 0.0, got 0"),
         ("[limits]\nlon_m = inf", "limits.lon_m: expected `float` <= 1000000000.0, got inf"),
         ('[map_frame]\nkind = "utm"\nzone = 32\norigin = [nan, 0, 0]', "map_frame: map frame: origin: expected finite"),
-        ("[topics]\nlidar = '/x'", "topics.lidar: no such sensor, expected one of imu, gnss,"),
+        ("[topics]\nradar = '/x'", "topics.radar: no such sensor, expected one of imu, gnss,"),
         ("[hide_gnss]\nevery_s = 1e-9\nlength_s = 1e-10", "hide_gnss: expected a LENGTH of at least 0.1 s, got 1e-10"),
         ('vehicle = "a\\u0000b"', "expected TOML: embedded null byte"),
     ],

@@ -113,7 +113,7 @@ def test_facts_that_are_wrong(fact: str, value: object, said: str, path: Path) -
 
 
 def test_columns_that_are_wrong(path: Path) -> None:
-    whole = path.read_bytes()
+    whole, x = path.read_bytes(), pq.read_table(path).column("x").to_pylist()
 
     def said_of(name: str, values: pa.Array) -> str:
         path.write_bytes(whole)
@@ -134,6 +134,7 @@ def test_columns_that_are_wrong(path: Path) -> None:
     assert "x, y, z: expected lists of the same lengths" in said_of("z", pa.array([[1]] * 90, lists))
     assert "x: expected lists, got 90 nulls" in said_of("x", pa.nulls(90, lists))
     assert "x: expected numbers, got" in said_of("x", pa.array([[1, None]] * 40 + [[1]] * 50, lists))
+    assert "x: expected surfels by rising x" in said_of("x", pa.array(x[:50] + x[50:][::-1], lists))
     assert "expected the columns kind" in said_of("x", pa.array([1.0] * 90))
 
 
