@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from replay.drive import read_reference
 from sensors.clouds import read_cloud
 from sensors.errors import EgolocError
-from sensors.geodesy import MapFrame
+from sensors.geodesy import MapFrame, map_from_llh
 from sensors.maps.accumulation import Reach, accumulation
 from sensors.maps.alignment import AlignConfig, Alignment, align, listed
 from sensors.maps.frame_text import text_of
+from sensors.maps.joining import is_same_grid, moved
 from sensors.maps.map_file import open_map
 from sensors.maps.registration import sampled
 from sensors.maps.surfels import SurfelConfig, surfels_in
@@ -26,12 +27,14 @@ from sensors.maps.voxels import Voxels
 from sensors.mcap.frames import read_frames
 from sensors.mcap.io import read_log
 from sensors.mcap.topics import CAMERA, LIDAR
-from sensors.records import Trajectory
+from sensors.records import Log, Trajectory
 from sensors.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
 Tell = Callable[[str], None]
 
+ELSEWHERE_M = 100.0
+"""A trajectory, or surfels, so far from what they belong to are in another frame."""
 SIGHTINGS, APART_S = 3, 1.0
 """What stands still is hit so often, each time this much later, s: a car at 3 m/s is 2 s within a voxel of 1 m."""
 
@@ -67,15 +70,15 @@ def is_log(path: Path) -> bool:
 def read_drive(
     path: Path, trajectory: Path | None, topics: Mapping[str, str] | None = None, frame: MapFrame | None = None
 ) -> Drive:
-    """A log's reference, or a trajectory file or run instead. frame: the map's, where the log does not say.
+    """A log's reference, or a trajectory file or run instead. frame: the map's, where the log does not say its own.
 
-    Raises EgolocError where there is no trajectory, or no map frame.
+    Raises EgolocError where there is no trajectory, or no map frame, or the log's is on another grid than frame.
     """
     topics = dict(topics or {})
     lidar = topics.pop(LIDAR, None)
     topics.pop(CAMERA, None)
     log = read_log(path, topics)
-    if log.map_frame is not None and frame is not None and log.map_frame != frame:
+    if log.map_frame is not None and frame is not None and not is_same_grid(log.map_frame, frame):
         raise EgolocError(f"{path}: expected map frame {text_of(frame)}, got a log in {text_of(log.map_frame)}")
     frame = log.map_frame or frame
     reference = log.reference
@@ -84,11 +87,32 @@ def read_drive(
         if not file.is_file():
             raise EgolocError(f"{file}: no such file: expected a trajectory, or a run made with --smooth")
         reference, frame = read_reference(file, frame, log.vehicle)
+        _refuse_elsewhere(file, reference, frame, log)
     if reference is None or not len(reference):
         raise EgolocError(f"{path}: expected a log with a reference trajectory, got none: give --trajectory FILE")
     if frame is None:
         raise EgolocError(f"{path}: expected a log with a map frame, got none: give --frame")
     return Drive(path, reference, frame, log.vehicle, lidar)
+
+
+def _refuse_elsewhere(file: Path, trajectory: Trajectory, frame: MapFrame | None, log: Log) -> None:
+    """Refuse a trajectory that is far from where the log says that it was: most often it is in another frame."""
+    known = log.reference
+    if known is None and log.gnss is not None and frame is not None:
+        known = Trajectory(log.gnss.t_ns, log.gnss.t_ns, map_from_llh(frame, log.gnss.llh))
+    if known is None or frame is None or not len(known) or not len(trajectory):
+        return
+    within = (trajectory.t_ns >= known.t_ns[0]) & (trajectory.t_ns <= known.t_ns[-1])
+    if not within.any():
+        return
+    t_ns, p = trajectory.t_ns[within], trajectory.p_map[within, :2]
+    there = np.column_stack([np.interp(t_ns, known.t_ns, known.p_map[:, axis]) for axis in range(2)])
+    away = float(np.median(np.hypot(*(p - there).T)))
+    if away > ELSEWHERE_M:
+        raise EgolocError(
+            f"{file}: expected a trajectory in the log's map frame {text_of(frame)}, "
+            f"it lies {away:.0f} m (median) from where the log was"
+        )
 
 
 def survey_drive(drive: Drive, config: SurfelConfig, reach: Reach, tell: Tell) -> Survey:
@@ -129,7 +153,15 @@ def survey_clouds(paths: Sequence[Path], frame: MapFrame | None, config: SurfelC
 
 
 def added_to(vector_map: VectorMap, survey: Survey) -> Survey:
-    """The survey with the elements of a map, whose own surfels are replaced."""
+    """The survey with the elements of a map, whose own surfels are replaced.
+
+    Raises EgolocError where it comes nowhere near them.
+    """
+    survey = replace(survey, map=moved(survey.map, vector_map.frame))
+    away = _between(vector_map.elements.xyz[:, :2], survey.map.surfels.p)
+    if away > ELSEWHERE_M:
+        name = survey.map.sources[0]
+        raise EgolocError(f"{name}: expected surfels near the map's elements, they lie {away / 1e3:.1f} km away")
     sources = (*vector_map.sources, *(name for name in survey.map.sources if name not in vector_map.sources))
     return replace(survey, map=replace(vector_map, surfels=survey.map.surfels, sources=sources))
 
@@ -155,11 +187,15 @@ def align_drive(
 
 
 def map_in(path: Path, frame: MapFrame | None) -> VectorMap:
-    """A map file, whole. Raises EgolocError where it is in another frame."""
+    """A map file, whole, moved where it only has another origin. Raises EgolocError where it is in another frame."""
     with open_map(path) as opened:
-        if frame is not None and opened.frame != frame:
-            raise EgolocError(f"{path}: expected map frame {text_of(frame)}, got a map in {text_of(opened.frame)}")
-        return opened.whole()
+        own = opened.frame
+        if frame is None or own == frame:
+            return opened.whole()
+        if not is_same_grid(own, frame):
+            got = f"expected map frame {text_of(frame)}, got a map in {text_of(own)}"
+            raise EgolocError(f"{path}: {got}: import it anew with --frame")
+        return moved(opened.whole(), frame)
 
 
 def _of_map(path: Path, frame: MapFrame, config: AlignConfig) -> Floats:
@@ -183,6 +219,14 @@ def _cloud(path: Path, frame: MapFrame | None, left_out: Counter[str]) -> tuple[
         raise EgolocError(f"{path}: expected points, got none")
     left_out.update({row.reason: row.count for row in cloud.left_out})
     return cloud.xyz, own
+
+
+def _between(one: Floats, other: Floats) -> float:
+    """Metres between the boxes around places (N, 2) and (M, 2); 0 where they meet, or there are none."""
+    if not len(one) or not len(other):
+        return 0.0
+    gap = np.maximum(one.min(axis=0) - other.max(axis=0), other.min(axis=0) - one.max(axis=0))
+    return float(np.hypot(*np.maximum(gap, 0.0)))
 
 
 def _some(vector_map: VectorMap, path: Path) -> VectorMap:

@@ -114,8 +114,10 @@ def align(
     scans = Scans()
     t_ns: list[int] = []
     poses: list[Floats] = []
+    near = 0
     for placed in steps.placed(frames):
         if t_ns and not _moved(poses[-1], placed.T_map_body, placed.frame_ns - t_ns[-1], config):
+            near += 1
             continue
         tell(f"{len(t_ns) + 1} frames")
         T = placed.T_map_body
@@ -123,7 +125,7 @@ def align(
         t_ns.append(placed.frame_ns)
         poses.append(T)
     if len(t_ns) < (2 if cloud is None else 1):
-        raise EgolocError(_too_few(len(t_ns), steps.left_out))
+        raise EgolocError(_too_few(len(t_ns), near, steps.left_out))
     stamps, T_given = np.array(t_ns, np.int64), np.array(poses)
     found = _Found(steps.left_out)
     if cloud is None:
@@ -211,9 +213,10 @@ def _to_cloud(found: _Found, scans: Scans, T: Floats, cloud: Floats, config: Ali
             turn, shift = match.T[:3, :3] @ T[second, :3, :3].T, match.T[:3, 3] - T[second, :3, 3]
 
 
-def _too_few(count: int, left_out: Counter[str]) -> str:
+def _too_few(count: int, near: int, left_out: Counter[str]) -> str:
+    close = f", {near} more too near to it" if near else ""
     reasons = f": {listed(left_out)}" if left_out else ""
-    return f"expected frames with LiDAR points along the trajectory, got {count} that can be used{reasons}"
+    return f"expected frames with LiDAR points along the trajectory, got {count} that can be used{close}{reasons}"
 
 
 def listed(left_out: Counter[str]) -> str:

@@ -3,7 +3,7 @@
 One row an element and one a surfel; all numbers are integers (``sensors.maps.quantized``), all codes words.
 """
 
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ from sensors.maps.quantized import (
     normals_from_bytes,
     ratios_from_bytes,
 )
-from sensors.maps.vector_map import Colour, Elements, Kind, Style, Surfels
+from sensors.maps.vector_map import Colour, Elements, Kilometres, Kind, Style, Surfels
 
 VERSION = 1
 FACTS_KEY = b"egoloc_map"
@@ -63,9 +63,9 @@ class Facts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     version: int
     frame: MapFrame
     sources: tuple[str, ...]
-    road_km: float | None
+    road_km: Kilometres | None
     tile_m: float
-    counts: dict[str, int]
+    counts: dict[str, Annotated[int, msgspec.Meta(ge=0)]]
     tiles: list[tuple[int, int, int, int]]
     columns: dict[str, str]
 

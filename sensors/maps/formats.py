@@ -41,7 +41,7 @@ def read_map(
     path = Path(path)
     if format is not None and format not in FORMATS:
         raise EgolocError(f"format {format}: expected one of {', '.join(FORMATS)}")
-    if not path.exists():
+    if not (path.is_file() or path.is_dir()):
         raise EgolocError(f"{path}: no such file or folder")
     format = format or guessed(path)
     if rules and format != "geojson":

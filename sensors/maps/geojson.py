@@ -17,7 +17,7 @@ from sensors.geodesy import Floats, MapFrame
 from sensors.maps.builder import Builder
 from sensors.maps.json_text import read_json
 from sensors.maps.placing import placed
-from sensors.maps.vector_map import Colour, Kind, Style, VectorMap
+from sensors.maps.vector_map import Colour, Kilometres, Kind, Style, VectorMap
 from sensors.records import LeftOut
 
 Position = Annotated[list[float], msgspec.Meta(min_length=2)]
@@ -39,7 +39,7 @@ class Own(msgspec.Struct):
     """What a map of ours has and a GIS does not know."""
 
     frame: MapFrame
-    road_km: float | None = None
+    road_km: Kilometres | None = None
 
 
 class _Geometry(msgspec.Struct, tag_field="type"):

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sensors.errors import EgolocError
+from sensors.geodesy import MapFrame
 from sensors.maps.quantized import cm_from_m
 from sensors.maps.vector_map import NO_ELEMENTS, NO_SURFELS, Elements, Kind, Surfels, VectorMap
 from sensors.records import LeftOut
@@ -65,6 +66,23 @@ def joined_maps(maps: Sequence[VectorMap]) -> tuple[VectorMap, tuple[LeftOut, ..
         tuple(source for part in parts for source in part.sources),
         None if None in lengths else float(sum(filter(None, lengths))),
     ), tuple(left_out)
+
+
+def is_same_grid(one: MapFrame, other: MapFrame) -> bool:
+    """Whether coordinates of two frames differ by a shift at most: their UTM zone is one."""
+    return one == other or (one.kind == other.kind == "utm" and (one.zone, one.south) == (other.zone, other.south))
+
+
+def moved(vector_map: VectorMap, frame: MapFrame) -> VectorMap:
+    """The map in a frame of the same UTM zone with another origin."""
+    shift = np.subtract(vector_map.frame.origin, frame.origin)
+    elements, surfels = vector_map.elements, vector_map.surfels
+    return replace(
+        vector_map,
+        frame=frame,
+        elements=replace(elements, xyz=elements.xyz + shift),
+        surfels=replace(surfels, p=surfels.p + shift[:2], z=surfels.z + shift[2]),
+    )
 
 
 def _unseen(elements: Elements, seen: set[bytes]) -> NDArray[np.bool_]:

@@ -10,6 +10,9 @@ from sensors.errors import EgolocError
 MAX_BYTES = 1 << 28
 """Some thousand kilometres of road; in memory it takes about ten times as much."""
 
+BOM = b"\xef\xbb\xbf"
+"""Which some programs write before UTF-8."""
+
 T = TypeVar("T")
 
 
@@ -20,10 +23,12 @@ def read_json(path: Path, kind: type[T], max_bytes: int = MAX_BYTES) -> T:
     none), or a field is missing or of another type (with its path, ``$.features[3].geometry``).
     """
     try:
-        size = path.stat().st_size
-        if size > max_bytes:
-            raise EgolocError(f"{path}: expected at most {max_bytes >> 20} MB of JSON, got {size / (1 << 20):.0f} MB")
-        return msgspec.json.decode(path.read_bytes(), type=kind)
+        with path.open("rb") as handle:
+            text = handle.read(max_bytes + 1)  # a size that the system tells is not that of every file
+        if len(text) > max_bytes:
+            size = max(path.stat().st_size, len(text)) / (1 << 20)
+            raise EgolocError(f"{path}: expected at most {max_bytes >> 20} MB of JSON, got {size:.0f} MB or more")
+        return msgspec.json.decode(text.removeprefix(BOM), type=kind)
     except OSError as error:
         raise EgolocError(f"{path}: cannot be read: {error.strerror}") from error
     except msgspec.ValidationError as error:

@@ -36,6 +36,8 @@ from sensors.records import LeftOut
 
 SAME_SHAPE_M = 1.0
 """Between lat and lon and local coordinates, after shift, turn and scale. Written by one program they agree to 1 um."""
+MAX_HEIGHT_M = 1000.0
+"""Of a pole or a face."""
 MAX_SCALE = 0.01
 """Between them; that of a projection is 0.0004 to 0.001."""
 
@@ -86,9 +88,11 @@ def _used(osm: Osm) -> list[int]:
 def _same_shape(nodes: Nodes, rows: list[int]) -> bool:
     """Whether lat, lon and local coordinates differ by a shift, a small scale and a turn."""
     llh = np.column_stack((np.radians(nodes.lat_lon[rows]), np.zeros(len(rows))))
-    if (np.abs(nodes.lat_lon[rows]) > (84.5, 360.0)).any() or np.ptp(nodes.lat_lon[rows, 1]) > 6.0:
+    try:
+        earth = placed("", llh, None)[1][:, :2] @ (1, 1j)
+    except EgolocError:  # they are no place of a map
         return False
-    earth, local = placed("", llh, None)[1][:, :2] @ (1, 1j), nodes.local[rows] @ (1, 1j)
+    local = nodes.local[rows] @ (1, 1j)
     earth, local = earth - earth.mean(), local - local.mean()
     turn = np.vdot(local, earth) / max(np.vdot(local, local).real, 1e-9)
     return bool(abs(abs(turn) - 1.0) < MAX_SCALE and np.abs(earth - turn * local).max() < SAME_SHAPE_M)
@@ -178,7 +182,7 @@ class _Importer:
             height = float(way.tags.get("height", "nan"))
         except ValueError:
             height = -1.0
-        if height < 0 or np.isinf(height):
+        if height < 0 or height > MAX_HEIGHT_M:
             raise EgolocError(f"{self.path}: way {way.id}: height: expected metres, got {way.tags['height']!r}")
         return height
 

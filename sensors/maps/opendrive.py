@@ -95,6 +95,9 @@ def _in_frame(
         target, xyz = LOCAL, world
     else:
         target, xyz = placed(str(path), reference.llh(world), frame, reference.zone)
+        if len(world) and frame is None and reference.zone and abs(reference.zone) != target.zone:
+            reason = f"zones: the georeference names {abs(reference.zone)}, the coordinates lie in {target.zone}"
+            builder.leave_out(f"{reason}, where they are placed (are they local ones?)")
     return replace(local, frame=target, elements=replace(local.elements, xyz=xyz)), builder.left_out
 
 

@@ -117,15 +117,19 @@ def _add_marks(road: Road, section: Section, lane: Lane, s: Floats, border: Floa
         if chosen.sum() < 2:
             builder.leave_out("road marks without length")
             continue
-        kind, style, colour = _looks(mark, lane)
+        kind, style, colour = _looks(mark, lane, builder)
         line = _shifted(mark, road.surface.plan, s[chosen], border[chosen])
         builder.add(kind, simplified(line), style, colour, f"road {road.id} lane {lane.id} s {start:.1f}")
         if mark.find("sway") is not None:
             builder.leave_out("sways of road marks: the line is taken straight")
 
 
-def _looks(mark: Element, lane: Lane) -> tuple[Kind, Style, Colour]:
+def _looks(mark: Element, lane: Lane, builder: Builder) -> tuple[Kind, Style, Colour]:
     """Double lines are named from the middle of the road outwards, on the centre lane from left to right."""
+    if mark.get("type", "") not in MARKS:
+        builder.leave_out("types of road marks that are not known: the line is taken without style")
+    if mark.get("color", "standard") not in COLOURS:
+        builder.leave_out("colours that are not known: the line is taken without")
     kind, style = MARKS.get(mark.get("type", ""), (Kind.LANE_LINE, Style.UNKNOWN))
     style = MIRRORED.get(style, style) if lane.id > 0 else style
     colour = COLOURS.get(mark.get("color", "standard"), Colour.UNKNOWN)

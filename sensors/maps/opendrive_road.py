@@ -12,6 +12,10 @@ from sensors.maps.road_geometry import MAX_TURN_RAD, PlanView, Shape
 from sensors.maps.road_surface import CrossShape, Cubics, RoadSurface
 from sensors.maps.vector_map import Floats
 
+GAP_M, BROKEN_M = 0.05, 1.0
+"""Between pieces of a reference line: a gap that is told, and one that makes it none."""
+JUST_BEFORE_M = 1e-6
+"""Of the end of a piece, where the next has not begun."""
 SHORTEST_M = 1e-4
 """Pieces of a reference line below this come from rounding in exporters."""
 LONGEST_M = 1e6
@@ -103,7 +107,26 @@ def _plan_view(road: Element, builder: Builder) -> PlanView | None:
     order = np.argsort(table[:, 0], kind="stable")
     columns = np.ascontiguousarray(table[order].T)
     s, x, y, heading, size = columns[:5]
-    return PlanView(s, x, y, heading, size, np.array(shapes, np.int8)[order], columns[5:].T)
+    plan = PlanView(s, x, y, heading, size, np.array(shapes, np.int8)[order], columns[5:].T)
+    _check_joints(road, plan, builder)
+    return plan
+
+
+def _check_joints(road: Element, plan: PlanView, builder: Builder) -> None:
+    """Refuse a reference line in pieces; count small gaps, and a length that is not the line's."""
+    if len(plan.s) > 1:
+        apart = np.hypot(*(plan.at(plan.s[1:] - JUST_BEFORE_M)[:, :2] - np.column_stack((plan.x, plan.y))[1:]).T)
+        worst = int(np.argmax(apart))
+        if apart[worst] > BROKEN_M:
+            where = f"planView: expected pieces that join, the one at s {plan.s[worst + 1]:g}"
+            raise mistake(road, f"{where} begins {apart[worst]:.3g} m from the end of the one before")
+        if (apart > GAP_M).any():
+            builder.leave_out(
+                f"gaps of up to {BROKEN_M:g} m between pieces of reference lines", int((apart > GAP_M).sum())
+            )
+    length = number(road, "length", float(plan.s[-1] + plan.length[-1]))
+    if abs(length - plan.s[-1] - plan.length[-1]) > BROKEN_M:
+        builder.leave_out("lengths of roads that differ from their reference lines': the lines' are taken")
 
 
 def _shape(geometry: Element, length: float) -> tuple[Shape, list[float]]:

@@ -50,7 +50,7 @@ def write_map(vector_map: VectorMap, path: str | os.PathLike[str], tile_m: float
     if not 1.0 <= tile_m <= 100_000.0:
         raise EgolocError(f"tile_m: expected 1..100000, got {tile_m:g}")
     target = Path(path)
-    _check(vector_map)
+    _check(vector_map, target)
     with _replaced(target) as partial:
         _write(vector_map, partial, tile_m)
 
@@ -113,17 +113,17 @@ def _facts(vector_map: VectorMap, tile_m: float, boxes: list[Box]) -> Facts:
     )
 
 
-def _check(vector_map: VectorMap) -> None:
+def _check(vector_map: VectorMap, target: Path) -> None:
     """Raise where a coordinate does not fit."""
     elements, surfels = vector_map.elements, vector_map.surfels
     vertex = _too_far(elements.xyz)
     if vertex is not None:
         row = int(np.searchsorted(elements.first, vertex, side="right")) - 1
         named = elements.name[row] or f"element {row}"
-        raise EgolocError(f"{named}: expected coordinates within 21,474 km, got {elements.xyz[vertex]}")
+        raise EgolocError(f"{target}: {named}: expected coordinates within 21,474 km, got {elements.xyz[vertex]}")
     surfel = _too_far(np.column_stack((surfels.p, surfels.z)))
     if surfel is not None:
-        raise EgolocError(f"surfel {surfel}: expected coordinates within 21,474 km, got {surfels.p[surfel]}")
+        raise EgolocError(f"{target}: surfel {surfel}: expected coordinates within 21,474 km, got {surfels.p[surfel]}")
 
 
 def _too_far(metres: NDArray[np.float64]) -> int | None:

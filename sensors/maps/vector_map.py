@@ -6,8 +6,9 @@ collects its elements with ``sensors.maps.builder``, and a file holds them tile 
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +18,8 @@ from sensors.geodesy import MapFrame
 Floats = NDArray[np.float64]
 Codes = NDArray[np.int8]
 Indices = NDArray[np.int64]
+Kilometres = Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
+"""Of road in a file; a million is more than any country has in one map."""
 
 
 class Kind(IntEnum):

@@ -131,6 +131,7 @@ def _gigabyte(path: Path) -> Path:
     return path
 
 
+OWN = '{"type":"FeatureCollection","features":[],"egoloc":{"frame":{"kind":"utm","zone":32},"road_km":%d}}'
 BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a.osm": (lambda p: _text(p, "<!DOCTYPE a [<!ENTITY b 'c'>]><osm/>"), "without document type or entities"),
     "b.osm": (lambda p: _text(p, '<osm><way id="1"><nd ref="7"/><tag k="type" v="line_thin"/></way></osm>'), "node 7"),
@@ -139,6 +140,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "e.geojson": (lambda p: _text(p, '{"type": "FeatureCollection", "features": [{"type": "Future"}]}'), "Future"),
     "g.osm": (_gigabyte, "MB"),
     "h.geojson": (_gigabyte, "MB"),
+    "k.geojson": (lambda p: _text(p, OWN % -5), "road_km"),
     "i.bin": (lambda p: _text(p, "nothing"), "looks like no known map"),
     "j.osm": (lambda p: p, "no such file"),
 }
@@ -218,3 +220,8 @@ def test_check_lists_errors_and_says_so_by_its_exit_code(tmp_path: Path, capsys:
     (finding,) = json.loads(capsys.readouterr().out)["findings"]
     assert (finding["check"], finding["error"]) == ("duplicate", True)
     assert "none.parquet" in refusal(capsys, "map", "check", tmp_path / "none.parquet")
+
+
+def test_devices_are_no_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = refusal(capsys, "map", "import", "geojson", "/dev/zero", tmp_path / "map.parquet")
+    assert "/dev/zero: no such file or folder" in error

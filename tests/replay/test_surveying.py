@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,8 @@ Floats = NDArray[np.float64]
 Run = Callable[..., dict[str, Any]]
 
 UTM = MapFrame("utm", (455_000.0, 5_427_000.0, 110.0), 32)
-OTHER = MapFrame("utm", (456_000.0, 5_427_000.0, 110.0), 32)
+SHIFTED = MapFrame("utm", (456_000.0, 5_427_000.0, 110.0), 32)
+OTHER = MapFrame("utm", (456_000.0, 5_427_000.0, 110.0), 33)
 STREET = block(41)
 TRUTH = around(STREET, 0.25)
 BIAS = np.array([0.25, -0.2, 0.1])
@@ -111,6 +113,38 @@ def test_the_elements_of_a_map_are_kept(run: Run, folder: Path, tmp_path: Path) 
     assert (again["surfels"], again["elements"]) == (100, 1)
 
 
+def test_a_map_with_another_origin_is_brought_together_with_the_log(run: Run, folder: Path, tmp_path: Path) -> None:
+    builder = Builder("hand")
+    builder.add(Kind.LANE_LINE, [[-1000.0, 0.0, 5.0], [-980.0, 0.0, 5.0]])
+    write_map(builder.built(SHIFTED), tmp_path / "lines.parquet")
+    truth = ("--trajectory", folder / "truth.csv")
+    run(Surfels, folder / "log.mcap", tmp_path / "m.parquet", "--map", tmp_path / "lines.parquet", *truth)
+    run(Surfels, folder / "log.mcap", tmp_path / "alone.parquet", *truth)
+    with open_map(tmp_path / "m.parquet") as opened, open_map(tmp_path / "alone.parquet") as other:
+        found, alone = opened.whole(), other.whole().surfels
+    assert found.frame == SHIFTED
+    np.testing.assert_allclose(found.surfels.p, alone.p - (1000.0, 0.0), atol=1e-6)
+    said = run(Align, folder / "log.mcap", tmp_path / "t.csv", "--map", tmp_path / "m.parquet")
+    assert said["correction_m"]["mean"] == pytest.approx(np.hypot(*BIAS[:2]), abs=0.08)
+
+
+def test_a_trajectory_in_another_frame_is_refused(run: Run, folder: Path, tmp_path: Path) -> None:
+    absolute = replace(TRUTH, p_map=TRUTH.p_map + UTM.origin)
+    write_trajectory(absolute, tmp_path / "absolute.csv")
+    for kind, target in ((Surfels, "m.parquet"), (Align, "t.csv")):
+        with pytest.raises(EgolocError, match=r"absolute\.csv: expected a trajectory in the log's map frame"):
+            run(kind, folder / "log.mcap", tmp_path / target, "--trajectory", tmp_path / "absolute.csv")
+        assert not (tmp_path / target).exists()
+
+
+def test_surfels_far_from_the_elements_are_refused(run: Run, folder: Path, tmp_path: Path) -> None:
+    builder = Builder("hand")
+    builder.add(Kind.LANE_LINE, [[9000.0, 0.0, 5.0], [9020.0, 0.0, 5.0]])
+    write_map(builder.built(UTM), tmp_path / "far.parquet")
+    with pytest.raises(EgolocError, match=r"expected surfels near the map's elements, they lie \d\.\d km away"):
+        run(Surfels, folder / "ground.npz", tmp_path / "m.parquet", "--map", tmp_path / "far.parquet")
+
+
 def errors(path: Path) -> tuple[Trajectory, Floats]:
     found, _ = read_trajectory(path, UTM)
     rows = np.searchsorted(TRUTH.t_ns, found.t_ns)
@@ -170,7 +204,7 @@ WRONG = [
     ([Surfels, "{f}/bare.mcap", "{t}/m"], "bare.mcap: expected LiDAR frames along the trajectory, got none"),
     ([Surfels, "{f}/log.mcap", "{t}/m", "--trajectory", "{f}/late.csv"], "outside of the trajectory"),
     ([Surfels, "{f}/log.mcap", "{t}/m", "--trajectory", "{f}/none.csv"], "none.csv: no such file"),
-    ([Surfels, "{f}/log.mcap", "{t}/m", "--map", "{f}/other.parquet"], "log.mcap: expected map frame utm:32N:456000"),
+    ([Surfels, "{f}/log.mcap", "{t}/m", "--map", "{f}/other.parquet"], "log.mcap: expected map frame utm:33N:456000"),
     ([Align, "{f}/bare.mcap", "{t}/t.csv"], "bare.mcap: expected frames with LiDAR points"),
     ([Align, "{f}/log.mcap", "{t}/t.csv", "--trajectory", "{f}/late.csv"], "outside of the trajectory"),
     ([Align, "{f}/log.mcap", "{t}/t.csv", "--map", "{f}/lines.parquet"], "lines.parquet: expected a map with surfels"),

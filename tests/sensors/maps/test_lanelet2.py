@@ -241,3 +241,18 @@ def test_an_entity_bomb_is_refused(tmp_path: Path) -> None:
     path.write_text(f'<?xml version="1.0"?><!DOCTYPE osm [<!ENTITY e0 "ha">{bomb}]><osm>&e8;</osm>')
     with pytest.raises(EgolocError, match="document type"):
         read(path)
+
+
+def test_latitudes_that_are_no_place_leave_the_local_coordinates(tmp_path: Path) -> None:
+    nodes = [local(1, 0, 0), local(2, 10, 0)]
+    junk = [
+        text.replace('lat="" lon=""', f'lat="{lat}" lon="8.4"') for text, lat in zip(nodes, (49.0, 54.0), strict=True)
+    ]
+    far = [
+        text.replace('lat="" lon=""', f'lat="49.0" lon="{lon}"') for text, lon in zip(nodes, (8.4, 16.4), strict=True)
+    ]
+    for each in (junk, far):
+        found, left_out = read(osm(tmp_path / "a.osm", *each, way(9, [1, 2], "line_thin")))
+        assert found.frame == LOCAL
+        np.testing.assert_allclose(found.elements.xyz[:, 0], [0.0, 10.0])
+        assert {row.reason for row in left_out} == {"latitudes and longitudes that do not fit local_x and local_y"}

@@ -202,3 +202,29 @@ def test_a_map_without_roads_is_empty(tmp_path: Path) -> None:
     path = written(tmp_path, header=f"<geoReference>{UTM}</geoReference>")
     vector_map, left_out = opendrive.read(path)
     assert (len(vector_map.elements), vector_map.road_km, counts(left_out)) == (0, 0.0, {})
+
+
+def test_a_broken_reference_line_is_refused_and_a_small_gap_told(tmp_path: Path) -> None:
+    pieces = (
+        LINE.replace('length="100"', 'length="10"')
+        + '<geometry s="{s}" x="{x}" y="0" hdg="0" length="10"><line/></geometry>'
+    )
+    with pytest.raises(EgolocError, match=r"expected pieces that join, the one at s 50 begins 460 m from the end"):
+        imported(tmp_path, road(section(RIGHT), pieces.format(s=50, x=510)))
+    _, left_out = imported(tmp_path, road(section(RIGHT), pieces.format(s=10, x=10.2)))
+    assert left_out["gaps of up to 1 m between pieces of reference lines"] == 1
+    assert left_out["lengths of roads that differ from their reference lines': the lines' are taken"] == 1
+
+
+def test_coordinates_outside_of_the_zone_that_a_file_names_are_told(tmp_path: Path) -> None:
+    path = written(tmp_path, road(section(RIGHT)), header=f"<geoReference>{UTM}</geoReference>")
+    vector_map, left_out = opendrive.read(path)
+    assert vector_map.frame.zone == 31
+    assert any(row.reason.startswith("zones: the georeference names 32, the coordinates lie in 31") for row in left_out)
+
+
+def test_road_marks_that_are_not_known_are_told(tmp_path: Path) -> None:
+    lane = RIGHT.replace('type="solid" color="white"', 'type="foo" color="pink"')
+    _, left_out = imported(tmp_path, road(section(lane)))
+    assert left_out["types of road marks that are not known: the line is taken without style"] == 1
+    assert left_out["colours that are not known: the line is taken without"] == 1

@@ -11,7 +11,8 @@ from tests.sensors.maps.xodr import ARC, LINE, RIGHT, WIDTH, imported, only, roa
 
 def test_borders_of_a_curved_road_with_changing_widths(tmp_path: Path) -> None:
     """Reference line: a circle of 50 m around (0, 50). Widths and offset are cubics of s; a point's s is its angle."""
-    wide = '<width sOffset="0" a="3" b="0" c="0.001" d="-6.67e-6"/><width sOffset="60" a="5.16" b="0.02" c="0" d="0"/>'
+    wide = '<width sOffset="0" a="3" b="0" c="0.001" d="-6.666666666666667e-6"/>'
+    wide += '<width sOffset="60" a="5.16" b="0.02" c="0" d="0"/>'
     mark = '<roadMark sOffset="0" type="solid" color="yellow"/>'
     left = (
         f'<left><lane id="2" type="driving">{WIDTH}{mark}</lane><lane id="1" type="driving">{wide}{mark}</lane></left>'
@@ -38,7 +39,7 @@ def _around(xyz: Floats) -> tuple[Floats, Floats]:
 
 def _t(s: Floats, beside: float, more: float) -> Floats:
     """Where the border lies: offset, the changing lane beside the middle, and one of constant width."""
-    width = np.where(s < 60.0, 3.0 + 0.001 * s**2 - 6.67e-6 * s**3, 5.16 + 0.02 * (s - 60.0))
+    width = np.where(s < 60.0, 3.0 + 0.001 * s**2 - 6.666666666666667e-6 * s**3, 5.16 + 0.02 * (s - 60.0))
     return 0.01 * s + beside * width + more
 
 

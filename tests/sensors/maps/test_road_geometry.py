@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import fresnel
 
 from sensors.errors import EgolocError
+from sensors.maps.quantized import cm_from_m, m_from_cm
 from sensors.maps.road_geometry import PlanView, Shape
 from sensors.maps.road_sampling import refined, simplified
 from sensors.maps.road_surface import CrossShape, Cubics, RoadSurface
@@ -108,6 +109,15 @@ def test_a_shape_is_linear_between_its_sections() -> None:
     np.testing.assert_allclose(shape.at(s, t), [0.0, 0.25, 0.5, 0.3, 0.0], atol=1e-12)
 
 
+def _farthest(points: Floats, line: Floats) -> float:
+    """Of points (N, 3) from a polyline."""
+    off = np.full(len(points), np.inf)
+    for a, b in pairwise(line):
+        share = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+        off = np.minimum(off, np.linalg.norm(points - a - share[:, None] * (b - a), axis=1))
+    return float(off.max())
+
+
 def test_chords_stay_within_a_centimetre_and_are_few() -> None:
     surface = RoadSurface(_plan(Shape.CLOTHOID, (0.05, -0.05), 150.0), 150.0)
 
@@ -118,13 +128,11 @@ def test_chords_stay_within_a_centimetre_and_are_few() -> None:
     fine = curves(np.linspace(0.0, 150.0, 20_001))
     for row in range(3):
         line = simplified(curves(s)[:, row])
-        off = np.full(len(fine), np.inf)
-        for a, b in pairwise(line):
-            share = np.clip((fine[:, row] - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
-            off = np.minimum(off, np.linalg.norm(fine[:, row] - a - share[:, None] * (b - a), axis=1))
-        assert off.max() < 0.01
-        bend = np.linspace(0.05, -0.05, 1000)  # a chord of length c is c^2 bend / 8 off: the fewest that 9 mm take
-        fewest = 150.0 * np.sqrt(np.abs(bend * (1.0 - (-8.0, 0.0, 8.0)[row] * bend)) / (8.0 * 0.009)).mean()
+        assert _farthest(fine[:, row], line) < 0.0026
+        rounded = m_from_cm(cm_from_m(line))  # as a map file has it
+        assert _farthest(fine[:, row], rounded) < 0.01
+        bend = np.linspace(0.05, -0.05, 1000)  # a chord of length c is c^2 bend / 8 off: the fewest of 2.5 mm
+        fewest = 150.0 * np.sqrt(np.abs(bend * (1.0 - (-8.0, 0.0, 8.0)[row] * bend)) / (8.0 * 0.0025)).mean()
         assert len(line) < 2.0 * fewest  # splitting at the worst vertex can double it, no more
 
 
