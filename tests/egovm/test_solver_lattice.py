@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from egovm.lattice import LatticeConfig, between, candidates, compose, rotated, seen_from
+from egovm.config import LatticeConfig
+from egovm.lattice import between, candidates, compose, rotated, seen_from
 from sensors.errors import EgolocError
 from tests.egovm.reference_solver import lattice_poses, matrix, vector
 
