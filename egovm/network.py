@@ -1,4 +1,4 @@
-"""EgoVM as one network: points and images into BEV maps, pieces of map into embeddings, both into a pose (Algorithm 1)."""
+"""EgoVM as one network: sensors into BEV maps, pieces of map into embeddings, both into a pose (Algorithm 1)."""
 
 from dataclasses import dataclass
 from pathlib import Path
