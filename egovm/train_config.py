@@ -64,7 +64,7 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return msgspec.structs.replace(network, ablation=ABLATIONS[self.ablation])
 
 
-SMALL_LIDAR = TrainConfig(learning_rate=1e-3, loss=LossConfig(samples=256))
+SMALL_LIDAR = TrainConfig(steps=1000, learning_rate=1e-3, loss=LossConfig(samples=256))
 """Half an hour on two cores. 256 random poses instead of 512 take a tenth off a step."""
 TRAININGS = {"small-lidar": SMALL_LIDAR}
 

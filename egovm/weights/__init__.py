@@ -1,4 +1,7 @@
-"""Weights of a network: a safetensors file, and beside it the config that they belong to, as TOML."""
+"""Weights of a network: a safetensors file, and beside it the config that they belong to, as TOML.
+
+Beside this module lie the weights that come with egoloc; README.md is their card.
+"""
 
 from pathlib import Path
 
@@ -9,6 +12,14 @@ from torch import Tensor, nn
 from egovm.config import NetworkConfig
 from egovm.config_file import config_toml, read_toml, replaced
 from sensors.errors import EgolocError
+
+HERE = Path(__file__).parent
+
+
+def weights_path(given: str) -> Path:
+    """Weights that come with egoloc, by their name, or a file."""
+    own = HERE / f"{given}.safetensors"
+    return own if own.is_file() else Path(given)
 
 
 def save_weights(network: nn.Module, config: NetworkConfig, path: Path) -> None:
