@@ -13,7 +13,8 @@ from egovm.regression_solver import RegressedPose
 @dataclass(frozen=True, slots=True)
 class Judged:
     """Of B frames: error: (B, 3) estimate minus truth, m along and left of the true heading, rad; nees: (B, 3) squared
-    error by variance, of the same axes, and total: (B,) of all three; NaN without a covariance. found: (B,) bool."""
+    error by variance, of the same axes, and total: (B,) of all three; NaN without a covariance, infinite where one has
+    no width. found: (B,) bool."""
 
     error: Tensor
     nees: Tensor
@@ -37,7 +38,8 @@ def judged(estimate: PoseEstimate | RegressedPose, truth: Tensor) -> Judged:
     known = torch.isfinite(cov).flatten(1).all(1)
     safe = torch.where(known[:, None, None], cov, torch.eye(3).to(cov))
     nees = error.square() / safe.diagonal(dim1=1, dim2=2)
-    total = (error * torch.linalg.solve(safe, error)).sum(1)
+    solved, failed = torch.linalg.solve_ex(safe, error[..., None])
+    total = torch.where(failed == 0, (error * solved[..., 0]).sum(1), torch.full_like(error[:, 0], torch.inf))
     return Judged(
         error,
         torch.where(known[:, None], nees, unknown),
