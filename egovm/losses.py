@@ -8,10 +8,10 @@ from typing import Literal
 import msgspec
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits
 
 from egovm.batch import Truth
 from egovm.config import Ablation, LatticeConfig
+from egovm.focal import FocalByType
 from egovm.lattice import between, rotated
 from egovm.pose_solver import LevelEstimate, PoseEstimate, PoseSolver
 from egovm.random_poses import sample_poses
@@ -154,11 +154,10 @@ def focal_loss(logits: Tensor, drawn: Tensor, gamma: float = 2.0) -> Tensor:
 
     logits: (B, types, H, W); drawn: of the same shape, bool.
     """
-    entropy = binary_cross_entropy_with_logits(logits, drawn.to(logits.dtype), reduction="none")
-    missed = -torch.expm1(-entropy)  # 1 - p of what is true
-    by_type = (missed**gamma * entropy).sum((0, 2, 3))
+    by_type = FocalByType.apply(logits, drawn, gamma)  # type: ignore[no-untyped-call]
     cells = drawn.sum((0, 2, 3)).clamp(min=_FEWEST_CELLS * drawn[:, 0].numel())
-    return (by_type / cells).sum()
+    loss: Tensor = (by_type / cells).sum()
+    return loss
 
 
 def semantic_loss(logits: Sequence[Tensor], drawn: Sequence[Tensor]) -> Tensor:
