@@ -44,13 +44,15 @@ class Errors:
     seconds: Floats
 
 
-def evaluate(network: EgoVM, batches: EvaluationBatches, workers: int = 1, tell: Callable[[int], None] = id) -> Report:
+def evaluate(
+    network: EgoVM, batches: EvaluationBatches, workers: int = 1, tell: Callable[[int], object] = id
+) -> Report:
     """Figures of all frames of the batches; tell: how many are done."""
     return summary(errors_of(network, batches, workers, tell))
 
 
 @torch.inference_mode()
-def errors_of(network: EgoVM, batches: EvaluationBatches, workers: int, tell: Callable[[int], None]) -> Errors:
+def errors_of(network: EgoVM, batches: EvaluationBatches, workers: int, tell: Callable[[int], object]) -> Errors:
     """Run the network, ready for use, on every frame."""
     fast: Any = deployed(network)
     initial, found, seconds = [], [], []
@@ -98,8 +100,8 @@ def _axis(errors: Floats, below: tuple[float, ...]) -> Report:
 
 
 def _nees(errors: Errors) -> Report | None:
-    """Of frames that state a covariance; None where none does."""
-    stated = np.isfinite(errors.total)
+    """Of frames that state a covariance with a width, and how many state one without; None where there are none."""
+    stated = np.isfinite(errors.total) & np.isfinite(errors.nees).all(axis=1)
     if not stated.any():
         return None
     total = errors.total[stated]
@@ -108,6 +110,7 @@ def _nees(errors: Errors) -> Report | None:
         "mean_by_3": float(total.mean() / 3.0),
         "median_by_3": float(np.median(total) / 3.0),
         "beyond_99": float((total > TAIL).mean()),
+        "without_width": int(np.isinf(errors.total).sum()),
         **axes,
     }
 

@@ -38,8 +38,10 @@ def judged(estimate: PoseEstimate | RegressedPose, truth: Tensor) -> Judged:
     known = torch.isfinite(cov).flatten(1).all(1)
     safe = torch.where(known[:, None, None], cov, torch.eye(3).to(cov))
     nees = error.square() / safe.diagonal(dim1=1, dim2=2)
-    solved, failed = torch.linalg.solve_ex(safe, error[..., None])
-    total = torch.where(failed == 0, (error * solved[..., 0]).sum(1), torch.full_like(error[:, 0], torch.inf))
+    root, failed = torch.linalg.cholesky_ex(safe.double())
+    root = torch.where((failed == 0)[:, None, None], root, torch.eye(3, dtype=torch.float64))
+    white = torch.linalg.solve_triangular(root, error.double()[..., None], upper=False)
+    total = torch.where(failed == 0, white.square().sum((1, 2)).to(error), torch.full_like(error[:, 0], torch.inf))
     return Judged(
         error,
         torch.where(known[:, None], nees, unknown),

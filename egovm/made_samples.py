@@ -156,7 +156,8 @@ def _upright(world: World, xy: Floats, yaw: float) -> Floats:
     y = np.append(left, (port - right) / _TRACK_M)
     z = np.cross(x, y)
     x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
-    return np.stack((x, np.cross(z, x), z), axis=-1)
+    R: Floats = np.stack((x, np.cross(z, x), z), axis=-1)
+    return R
 
 
 def _tilt(angles: Floats) -> Floats:
@@ -178,7 +179,7 @@ def _compensated(
     recipe: Recipe, motion: Motion, scene: Scene, rng: Rng
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Points of one turn in body axes at its begin, brought there by the true motion; intensities and times."""
-    columns_s = column_times(recipe.lidar) * 1e-9
+    columns_s: Floats = column_times(recipe.lidar) * 1e-9
     p, R = motion.at(columns_s)
     turn = sweep(scene, p, R, recipe.lidar, rng)
     offset_s = turn.offset_ns * 1e-9

@@ -65,7 +65,8 @@ def load_sample(path: Path) -> Sample:
         held = dict(file.items())
     count = len(held["map_kind"])
     names = np.zeros(count, "<U1")
-    elements = Elements(*(held[f"map_{name}"] for name in _CODES), np.zeros(count, np.int32), names)
+    kind, style, colour, first, xyz = (held[f"map_{name}"] for name in _CODES)
+    elements = Elements(kind, style, colour, first, xyz, np.zeros(count, np.int32), names)
     return Sample(
         held["xyz"].astype(np.float32) * np.float32(_POINT_M),
         held["intensity"].astype(np.float32) / np.float32(FULL_INTENSITY),

@@ -47,5 +47,5 @@ def _notes(report: Mapping[str, Any]) -> list[str]:
     return [
         *notes,
         f"NEES/3: mean {nees['mean_by_3']:.2f}, median {nees['median_by_3']:.2f} (1 and 0.79 of true covariances);"
-        f" by axis {axes}; beyond 99 %: {percent(nees['beyond_99'])}.",
+        f" by axis {axes}; beyond 99 %: {percent(nees['beyond_99'])}; without any width: {nees['without_width']}.",
     ]

@@ -64,6 +64,16 @@ def test_an_infinite_covariance_states_nothing() -> None:
     assert found.total.isnan().tolist() == [True, False]
 
 
+def test_a_covariance_without_width_is_told_from_none() -> None:
+    cov = torch.zeros(2, 3, 3)
+    cov[1] = torch.eye(3)
+    found = judged(estimate(torch.ones(2, 3), cov), torch.zeros(2, 3))
+    assert found.total.tolist() == [math.inf, pytest.approx(3.0)]
+    report = summary(errors(2, nees=found.nees.numpy(), total=found.total.numpy(), estimate=np.ones((2, 3))))
+    assert report["nees"]["without_width"] == 1
+    assert report["nees"]["mean_by_3"] == pytest.approx(1.0)
+
+
 def errors(count: int = 4, **columns: object) -> Errors:
     given = {
         "initial": np.ones((count, 3)),
