@@ -172,14 +172,15 @@ def _about_z(angle: Floats) -> Floats:
     """(N, 3, 3)."""
     c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
     rows = np.stack((c, -s, zero, s, c, zero, zero, zero, zero + 1.0), axis=-1)
-    return rows.reshape(*angle.shape, 3, 3)
+    R: Floats = rows.reshape(*angle.shape, 3, 3)
+    return R
 
 
 def _compensated(
     recipe: Recipe, motion: Motion, scene: Scene, rng: Rng
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Points of one turn in body axes at its begin, brought there by the true motion; intensities and times."""
-    columns_s: Floats = column_times(recipe.lidar) * 1e-9
+    columns_s = np.asarray(column_times(recipe.lidar) * 1e-9, np.float64)
     p, R = motion.at(columns_s)
     turn = sweep(scene, p, R, recipe.lidar, rng)
     offset_s = turn.offset_ns * 1e-9

@@ -44,7 +44,7 @@ def wall_surfels(world: World, scene: Scene, xy: Floats, radius: float, rng: np.
     ray, beam = np.nonzero(on_wall)
     distance = hits.distance[on_wall] + rng.normal(0.0, RANGE_SIGMA_M, len(ray))
     found = surfels_of(origins[ray] + distance[:, None] * rays[ray, beam])
-    near: NDArray[np.bool_] = (np.abs(found.p - xy) < radius).all(axis=1)
+    near = np.asarray((np.abs(found.p - xy) < radius).all(axis=1))
     return found.chosen(near)
 
 
