@@ -161,11 +161,12 @@ def _upright(world: World, xy: Floats, yaw: float) -> Floats:
 
 
 def _tilt(angles: Floats) -> Floats:
-    """Roll and then pitch, rad."""
+    """(3, 3) of a roll and a pitch (2,), rad."""
     (cr, cp), (sr, sp) = np.cos(angles), np.sin(angles)
-    return np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]]) @ np.array(
-        [[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]]
-    )
+    pitch = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    R: Floats = pitch @ roll
+    return R
 
 
 def _about_z(angle: Floats) -> Floats:
