@@ -1,1 +1,1 @@
-"""EgoVM: poses from cameras, LiDAR and a vector map. Nothing is here yet; its results travel as ``sensors.PoseFix``."""
+"""EgoVM: poses from cameras, LiDAR and a vector map, as ``sensors.PoseFix``; how it is trained and judged."""

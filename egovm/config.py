@@ -3,6 +3,7 @@
 ``paper`` has the paper's sizes, ``small`` trains and runs on two CPU cores. A config goes with the weights, as TOML.
 """
 
+import math
 from itertools import pairwise
 from typing import Literal
 
@@ -103,14 +104,51 @@ class MatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise EgolocError(f"network: matching: sampled: expected 2 places or more, got {self.sampled}")
 
 
-class SolverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The histogram over poses."""
+class LatticeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which poses are candidates."""
 
     half_m: float = 3.0
     """Half of the search range at the first level, m; each next level halves it."""
     half_deg: float = 3.0
+    """The same of the yaw, degrees."""
     steps: int = 13
-    """Candidates by axis. The step at each level is its BEV cell."""
+    """Candidates by axis; odd, so that one stands in the middle."""
+    levels: int = 3
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.half_m < math.inf:
+            raise EgolocError(f"lattice: half_m: expected metres above 0, got {self.half_m:g}")
+        if not 0.0 < self.half_deg <= 45.0:
+            raise EgolocError(f"lattice: half_deg: expected degrees above 0 and at most 45, got {self.half_deg:g}")
+        if self.steps < 3 or self.steps % 2 == 0:
+            raise EgolocError(f"lattice: steps: expected an odd number of at least 3, got {self.steps}")
+        if self.levels < 1:
+            raise EgolocError(f"lattice: levels: expected 1 or more, got {self.levels}")
+
+    @property
+    def reach(self) -> int:
+        """Steps from the middle to the edge."""
+        return self.steps // 2
+
+    def step_m(self, level: int) -> float:
+        """Distance of neighbours at a level, which is the BEV cell there, m."""
+        return self.half_m / 2.0**level / self.reach
+
+    def step_rad(self, level: int) -> float:
+        """The same of the yaw, rad."""
+        return math.radians(self.half_deg) / 2.0**level / self.reach
+
+    def check_cells(self, cell_m: tuple[float, ...]) -> None:
+        """Raise where BEV maps with these cells do not fit: their cells are the steps of the levels."""
+        steps = tuple(self.step_m(level) for level in range(self.levels))
+        if len(cell_m) != self.levels or any(abs(a - b) > 1e-9 for a, b in zip(cell_m, steps, strict=True)):
+            raise EgolocError(f"lattice: expected BEV cells of {steps} m, the steps of the levels, got {cell_m}")
+
+
+class SolverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The histogram over poses."""
+
+    lattice: LatticeConfig = LatticeConfig()
     groups: int = 1
     """Dot products are taken by so many groups of channels."""
     alpha: float = 1.0
@@ -159,6 +197,7 @@ class NetworkConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
         if any(abs(2.0 * fine - coarse) > 1e-9 for coarse, fine in pairwise(bev.cell_m)):
             raise EgolocError(f"network: bev: cell_m: expected each half as wide as the one before, got {bev.cell_m}")
+        self.solver.lattice.check_cells(bev.cell_m)
         self._check_camera()
         self._check_lidar()
 
@@ -213,4 +252,15 @@ SMALL = NetworkConfig(
     fusion=FusionConfig(cell_m=1.0, layers=1, heads=4, cross_points=4, hidden=128),
     matching=MatchingConfig(layers=2, heads=4, hidden=128),
 )
-PRESETS = {config.name: config for config in (PAPER, SMALL)}
+SMALL_LIDAR = msgspec.structs.replace(SMALL, name="small-lidar", camera=None)
+PRESETS = {config.name: config for config in (PAPER, SMALL, SMALL_LIDAR)}
+_A3 = Ablation(surfels=False, semantic_supervision=False)
+ABLATIONS = {
+    "A1": Ablation(surfels=False),
+    "A2": Ablation(surfels=False, decoder=False),
+    "A3": _A3,
+    "A4": msgspec.structs.replace(_A3, semantic_embedding=False),
+    "A5": Ablation(surfels=False, random_pose_loss=False),
+    "A6": Ablation(surfels=False, solver="regression"),
+}
+"""Of the paper's Table 4, by name."""

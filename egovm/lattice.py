@@ -7,55 +7,10 @@ its step, all translations of one yaw then share their bilinear weights. (Eq. 6-
 lattice is regular in d.)
 """
 
-import math
-
-import msgspec
 import torch
 from torch import Tensor
 
-from sensors.errors import EgolocError
-
-
-class LatticeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which poses are candidates."""
-
-    half_m: float = 3.0
-    """Half of the search range at the first level, m; each next level halves it."""
-    half_deg: float = 3.0
-    """The same of the yaw, degrees."""
-    steps: int = 13
-    """Candidates by axis; odd, so that one stands in the middle."""
-    levels: int = 3
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.half_m < math.inf:
-            raise EgolocError(f"lattice: half_m: expected metres above 0, got {self.half_m:g}")
-        if not 0.0 < self.half_deg <= 45.0:
-            raise EgolocError(f"lattice: half_deg: expected degrees above 0 and at most 45, got {self.half_deg:g}")
-        if self.steps < 3 or self.steps % 2 == 0:
-            raise EgolocError(f"lattice: steps: expected an odd number of at least 3, got {self.steps}")
-        if self.levels < 1:
-            raise EgolocError(f"lattice: levels: expected 1 or more, got {self.levels}")
-
-    @property
-    def reach(self) -> int:
-        """Steps from the middle to the edge."""
-        return self.steps // 2
-
-    def step_m(self, level: int) -> float:
-        """Distance of neighbours at a level, which is the BEV cell there, m."""
-        return self.half_m / 2.0**level / self.reach
-
-    def step_rad(self, level: int) -> float:
-        """The same of the yaw, rad."""
-        return math.radians(self.half_deg) / 2.0**level / self.reach
-
-    def check_cells(self, cell_m: tuple[float, ...]) -> None:
-        """Raise where BEV maps with these cells do not fit: their cells are the steps of the levels."""
-        steps = tuple(self.step_m(level) for level in range(self.levels))
-        if len(cell_m) != self.levels or any(abs(a - b) > 1e-9 for a, b in zip(cell_m, steps, strict=True)):
-            raise EgolocError(f"lattice: expected BEV cells of {steps} m, the steps of the levels, got {cell_m}")
-
+from egovm.config import LatticeConfig
 
 PAPER = LatticeConfig()
 

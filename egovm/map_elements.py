@@ -75,9 +75,9 @@ def usable_half_m(config: NetworkConfig) -> float:
 
     The solver leaves out elements that some candidate does not see; so a long segment is cut off here instead.
     """
-    bev, solver = config.bev, config.solver
-    yaw = math.radians(solver.half_deg)
-    half = (bev.half_m - bev.cell_m[0] / 2 - solver.half_m) / (math.cos(yaw) + math.sin(yaw))
+    bev, lattice = config.bev, config.solver.lattice
+    yaw = math.radians(lattice.half_deg)
+    half = (bev.half_m - bev.cell_m[0] / 2 - lattice.half_m) / (math.cos(yaw) + math.sin(yaw))
     if half <= 0.0:
         raise EgolocError(f"network: bev: half_m: expected more than the search range, got {bev.half_m:g}")
     return half - 1e-3  # float32

@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from egovm.lattice import PAPER, LatticeConfig, candidates, compose, seen_from
+from egovm.config import LatticeConfig
+from egovm.lattice import PAPER, candidates, compose, seen_from
 from egovm.solver_modes import two_modes
 from egovm.solver_window import Window, dot_window, dots_at, lattice_dots, summed_lattice_dots
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from egovm.lattice import LatticeConfig, rotated, seen_from, yaws
+from egovm.config import LatticeConfig
+from egovm.lattice import rotated, seen_from, yaws
 from egovm.solver_dots import patch_dots
 from sensors.errors import EgolocError
 

@@ -21,6 +21,7 @@ from replay.commands.mapping import MapInfo
 from replay.commands.noise import Allan, Noise
 from replay.commands.replaying import Replay
 from replay.commands.surveying import Align, Surfels
+from replay.commands.training import Evaluate, Train
 from sensors.errors import EgolocError
 
 COMMANDS = {
@@ -35,6 +36,8 @@ COMMANDS = {
     "frames": Frames,
     "allan": Allan,
     "noise": Noise,
+    "train": Train,
+    "eval": Evaluate,
 }
 MAPS = {
     "import": ImportMap,

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from egovm.lattice import LatticeConfig, seen_from
+from egovm.config import LatticeConfig
+from egovm.lattice import seen_from
 
 CELLS_0 = 120
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from egovm.lattice import LatticeConfig
+from egovm.config import LatticeConfig
 
 Inputs = tuple[list[Tensor], list[Tensor], Tensor, Tensor]
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from egovm.batch import SURFEL
-from egovm.config import PAPER, Ablation, BevConfig, MatchingConfig, NetworkConfig
-from egovm.lattice import LatticeConfig
+from egovm.config import PAPER, Ablation, BevConfig, LatticeConfig, MatchingConfig, NetworkConfig
 from egovm.map_elements import Pieces, padded, pieces_around, places_of, usable_half_m
 from egovm.solver_window import dot_window
 from sensors.errors import EgolocError

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from egovm.batch import TYPES, Truth
-from egovm.config import Ablation
-from egovm.lattice import LatticeConfig, between
+from egovm.config import Ablation, LatticeConfig
+from egovm.lattice import between
 from egovm.losses import LossConfig, Losses, network_losses
 from egovm.pose_solver import PoseEstimate, PoseSolver
 from egovm.solver_window import in_window

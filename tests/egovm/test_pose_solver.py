@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from egovm.lattice import LatticeConfig, candidates
+from egovm.config import LatticeConfig
+from egovm.lattice import candidates
 from egovm.pose_solver import PoseSolver
 from egovm.solver_dots import gathered_dots, patch_dots
 from egovm.solver_window import dot_window, dots_at, in_window, lattice_dots, summed_lattice_dots

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from egovm.lattice import LatticeConfig, candidates
+from egovm.config import LatticeConfig
+from egovm.lattice import candidates
 from egovm.pose_solver import PoseEstimate, PoseSolver
 from sensors.errors import EgolocError
 from tests.egovm.solver_inputs import Inputs, inputs

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from egovm.lattice import LatticeConfig
+from egovm.config import LatticeConfig
 from egovm.pose_solver import PoseSolver
 
 LATTICE = LatticeConfig()

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from egovm.lattice import LatticeConfig, between, candidates, compose, rotated, seen_from
+from egovm.config import LatticeConfig, NetworkConfig, SolverConfig
+from egovm.lattice import between, candidates, compose, rotated, seen_from
 from sensors.errors import EgolocError
 from tests.egovm.reference_solver import lattice_poses, matrix, vector
 
@@ -68,3 +69,8 @@ def test_a_config_that_makes_no_lattice_is_refused(wrong: dict[str, float], mess
         LatticeConfig(**wrong)  # type: ignore[arg-type]
     with pytest.raises(msgspec.ValidationError, match=message):
         msgspec.convert(wrong, LatticeConfig)
+
+
+def test_a_network_whose_cells_are_no_steps_is_told() -> None:
+    with pytest.raises(EgolocError, match="lattice: expected BEV cells of"):
+        NetworkConfig(solver=SolverConfig(LatticeConfig(half_m=4.0)))

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from egovm.lattice import LatticeConfig, candidates
+from egovm.config import LatticeConfig
+from egovm.lattice import candidates
 from egovm.pose_solver import PoseEstimate, PoseSolver
 from egovm.solver_modes import two_modes
 from tests.egovm.landmark_planes import layout, planes
