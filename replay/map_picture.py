@@ -1,7 +1,5 @@
 """A map as a picture: its elements, and the predicted sigmas along the route, red where they degenerate."""
 
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +18,7 @@ from sensors.errors import EgolocError
 from sensors.maps.localizability import AXES, Localizability
 from sensors.maps.map_file import MapFile
 from sensors.maps.route import Route
+from sensors.whole_file import whole_file
 
 if TYPE_CHECKING:
     from replay.map_info import Info
@@ -189,12 +188,5 @@ def _title(info: "Info") -> str:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole_file(path) as partial:
         figure.savefig(partial, dpi=110, format="png", metadata={"Software": None})
-        partial.replace(path)
-    except OSError as error:
-        raise EgolocError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)

@@ -1,8 +1,6 @@
 """A map as a rerun recording: elements by kind, surfels by their normals, the route by what is predicted along it."""
 
 import math
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +20,7 @@ from sensors.maps.localizability import AXES, Localizability
 from sensors.maps.map_file import MapFile
 from sensors.maps.route import Route
 from sensors.maps.vector_map import Elements, Kind, Surfels
+from sensors.whole_file import whole_file
 
 if TYPE_CHECKING:
     from replay.map_info import Info
@@ -52,8 +51,7 @@ def write_map_recording(opened: MapFile, route: Route, found: Localizability, in
     if not len(opened.boxes):
         raise EgolocError(f"{path}: cannot be drawn: {opened.path} is empty")
     low, high = opened.boxes[:, :2].min(axis=0), opened.boxes[:, 2:].max(axis=0)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole_file(path, RuntimeError) as partial:  # rerun's own, where the disk is full
         partial.touch()  # rerun's own message would not be an OSError
         recording = rr.RecordingStream("egoloc_map")
         recording.save(partial, default_blueprint=_blueprint(high - low, route))
@@ -61,13 +59,6 @@ def write_map_recording(opened: MapFile, route: Route, found: Localizability, in
         _draw(recording, opened, route, found, info, (low + high) / 2.0)
         recording.flush(timeout_sec=WRITING_S)
         recording.disconnect()
-        partial.replace(path)
-    except (OSError, RuntimeError) as error:  # rerun's own, where the disk is full
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise EgolocError(f"{path}: cannot be written: {reason}") from None
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def _draw(

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from replay.drawing import INNOVATIONS, LIMIT_KEYS, SCALE, MapPlace, draw_lanes,
 from replay.run_columns import AXES, RunColumns, load_columns
 from replay.run_summary import facts, summary
 from sensors.errors import EgolocError
+from sensors.whole_file import whole_file
 
 WRITING_S = 300.0
 """Longest wait for the disk; without it rerun waits for ever."""
@@ -37,21 +37,13 @@ def write_recording(run: Path, rrd: Path | None = None, other: Path | None = Non
     span_ns = _common_span(runs, [run, other or run])
     place = _place(runs)
     roots = ["run"] if other is None else ["A", "B"]
-    part = target.with_name(f".{target.name}.part")
-    try:
+    with whole_file(target, RuntimeError) as part:  # rerun's own, where the disk is full
         part.touch()  # rerun's own message would not be an OSError
         recording = rr.RecordingStream("egoloc" if other is None else "egoloc_two_runs")
         recording.save(part, default_blueprint=arrange(_scene(runs, roots, span_ns, place)))
         _draw(recording, runs, roots, span_ns, place)
         recording.flush(timeout_sec=WRITING_S)
         recording.disconnect()
-        part.replace(target)
-    except (OSError, RuntimeError) as error:  # rerun's own, where the disk is full
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise EgolocError(f"{target}: cannot be written: {reason}") from None
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
     return target
 
 

@@ -1,14 +1,12 @@
 """A trajectory written as CSV with named columns, to the last bit; ``sensors.datasets.trajectory_file`` reads it."""
 
 import math
-import os
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from sensors.errors import EgolocError
 from sensors.records import Trajectory
+from sensors.whole_file import whole_file
 
 COLUMNS = ("t_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "sigma_m", "sigma_yaw")
 """Map coordinates m, body in map axes, standard deviations m and rad; an empty cell is not known."""
@@ -21,13 +19,6 @@ def write_trajectory(trajectory: Trajectory, path: Path) -> None:
         ",".join((str(t_ns), *("" if math.isnan(cell) else repr(cell) for cell in row)))
         for t_ns, row in zip(trajectory.t_ns.tolist(), values, strict=True)
     )
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole_file(path) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.write_text("\n".join((",".join(COLUMNS), *rows, "")), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise EgolocError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):  # where nothing could be written there is nothing to clear away
-            partial.unlink(missing_ok=True)

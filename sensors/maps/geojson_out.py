@@ -1,7 +1,5 @@
 """A map as GeoJSON, so that a GIS shows it: ``sensors.maps.geojson`` reads it back to 1 mm. Surfels stay behind."""
 
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,7 @@ from sensors.geodesy import Floats
 from sensors.maps.geojson import Own
 from sensors.maps.placing import LOCAL, geodetic
 from sensors.maps.vector_map import Colour, Kind, Style, VectorMap
+from sensors.whole_file import whole_file
 
 DEGREE_DIGITS, HEIGHT_DIGITS = 9, 4
 """Decimals: 0.1 mm."""
@@ -30,15 +29,8 @@ def write_geojson(vector_map: VectorMap, path: Path) -> None:
         )
     own = msgspec.to_builtins(Own(vector_map.frame, vector_map.road_km))
     text = msgspec.json.encode({"type": "FeatureCollection", "egoloc": own, "features": _features(vector_map)})
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(text)
-        temporary.replace(path)
-    except OSError as error:
-        raise EgolocError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+    with whole_file(path) as partial:
+        partial.write_bytes(text)
 
 
 def _features(vector_map: VectorMap) -> list[dict[str, Any]]:

@@ -65,9 +65,11 @@ def findings(vector_map: VectorMap) -> list[Finding]:
 
 
 def _all(vector_map: VectorMap) -> Iterator[Finding]:
+    from sensors.maps.geometries import geometries
     from sensors.maps.health_neighbours import neighbour_findings
     from sensors.maps.health_shapes import shape_findings
 
     if len(vector_map.elements):
-        yield from shape_findings(vector_map.elements)
-        yield from neighbour_findings(vector_map.elements, vector_map.surfels)
+        shapes = geometries(vector_map.elements)
+        yield from shape_findings(vector_map.elements, shapes)
+        yield from neighbour_findings(vector_map.elements, shapes, vector_map.surfels)

@@ -7,7 +7,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sensors.maps.geometries import geometries
 from sensors.maps.health import Check, Finding
 from sensors.maps.vector_map import Elements, Floats, Kind, Style, Surfels
 
@@ -35,9 +34,8 @@ _LINES = (Kind.LANE_LINE, Kind.ROAD_BOUNDARY)
 Rows = NDArray[np.int64]
 
 
-def neighbour_findings(elements: Elements, surfels: Surfels) -> Iterator[Finding]:
-    """Findings between elements."""
-    shapes = geometries(elements)
+def neighbour_findings(elements: Elements, shapes: NDArray[Any], surfels: Surfels) -> Iterator[Finding]:
+    """Findings between elements. shapes: (N,) the elements as ``sensors.maps.geometries`` has them."""
     seen = elements.style != Style.VIRTUAL
     tree = shapely.STRtree(shapes)
     yield from _repeated(elements, shapes, seen)

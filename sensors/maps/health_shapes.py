@@ -1,12 +1,12 @@
 """Checks of each element for itself."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sensors.maps.geometries import geometries
 from sensors.maps.health import Check, Finding
 from sensors.maps.vector_map import Elements, Floats, Kind, Style
 
@@ -31,8 +31,8 @@ LEAN = 0.35
 _ON_GROUND = (Kind.LANE_LINE, Kind.ROAD_BOUNDARY, Kind.STOP_LINE, Kind.CROSSING, Kind.MARKING)
 
 
-def shape_findings(elements: Elements) -> Iterator[Finding]:
-    """Findings of every element for itself."""
+def shape_findings(elements: Elements, shapes: NDArray[Any]) -> Iterator[Finding]:
+    """Findings of every element for itself. shapes: (N,) the elements as ``sensors.maps.geometries`` has them."""
     step, slope = _steps(elements)
     counts = np.diff(elements.first)
     long = counts > 1
@@ -52,7 +52,7 @@ def shape_findings(elements: Elements) -> Iterator[Finding]:
             detail = f"by {rise:+.2f} m within {step[vertex]:.2f} m"
             yield _at(elements, Check.STEEP, of[vertex], vertex - elements.first[of[vertex]], detail)
     yield from _turns(elements, of)
-    yield from _crossing_themselves(elements)
+    yield from _crossing_themselves(elements, shapes)
     yield from _rings(elements, counts)
     yield from _sizes(elements)
 
@@ -91,10 +91,9 @@ def _turns(elements: Elements, of: NDArray[np.int64]) -> Iterator[Finding]:
         yield _at(elements, Check.TURNS_BACK, of[vertex], vertex - elements.first[of[vertex]], f"by {turn:.0f} deg")
 
 
-def _crossing_themselves(elements: Elements) -> Iterator[Finding]:
-    lines = geometries(elements)
+def _crossing_themselves(elements: Elements, shapes: NDArray[Any]) -> Iterator[Finding]:
     suspect = np.isin(elements.kind, _ON_GROUND) & (elements.style != Style.ARROW) & (np.diff(elements.first) > 2)
-    for row in np.flatnonzero(suspect)[~shapely.is_simple(lines[suspect])]:
+    for row in np.flatnonzero(suspect)[~shapely.is_simple(shapes[suspect])]:
         place = _crossing(elements.vertices(int(row))[:, :2])
         if place is not None:
             yield Finding(Check.SELF_INTERSECTION, (int(row),), *place, "at this place first")

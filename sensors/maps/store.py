@@ -6,7 +6,6 @@ delta-coded, surfels by rising x (smaller than along a Hilbert curve), words and
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -22,6 +21,7 @@ from sensors.maps.columns import FACTS_KEY, KINDS, MEANING, SCHEMA, SURFEL, VERS
 from sensors.maps.quantized import CM_LIMIT, cm_from_m
 from sensors.maps.tiles import tile_numbers
 from sensors.maps.vector_map import NO_ELEMENTS, NO_SURFELS, Elements, Surfels, VectorMap
+from sensors.whole_file import whole_file
 
 Box = tuple[int, int, int, int]
 
@@ -51,7 +51,8 @@ def write_map(vector_map: VectorMap, path: str | os.PathLike[str], tile_m: float
         raise EgolocError(f"tile_m: expected 1..100000, got {tile_m:g}")
     target = Path(path)
     _check(vector_map, target)
-    with _replaced(target) as partial:
+    with whole_file(target, pa.ArrowException) as partial:
+        target.parent.mkdir(parents=True, exist_ok=True)
         _write(vector_map, partial, tile_m)
 
 
@@ -130,19 +131,3 @@ def _too_far(metres: NDArray[np.float64]) -> int | None:
     """The first row with a coordinate that a file cannot hold (NaN it can)."""
     wrong = (np.abs(cm_from_m(metres)) > CM_LIMIT).any(axis=1)
     return int(np.argmax(wrong)) if wrong.any() else None
-
-
-@contextmanager
-def _replaced(target: Path) -> Iterator[Path]:
-    """A temporary name that becomes the target when the block ends well; else nothing is left of it."""
-    partial = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        partial.replace(target)
-    except (OSError, pa.ArrowException) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise EgolocError(f"{target}: cannot be written: {reason}") from None
-    finally:
-        with suppress(OSError):  # where nothing could be written there is nothing to clear away
-            partial.unlink(missing_ok=True)

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 
 from sensors.errors import EgolocError
@@ -14,6 +13,7 @@ from sensors.mcap.summary import LogSummary, TopicSummary, describe
 from sensors.mcap.writer import ChunkWriter, Compression
 from sensors.pieces import PIECE_S, join
 from sensors.records import Frame, Log
+from sensors.whole_file import whole_file
 
 __all__ = ["LogSummary", "TopicSummary", "describe", "read_log", "read_pieces", "write_log"]
 
@@ -69,17 +69,10 @@ def write_log(
     target = Path(path)
     pieces = iter([log] if isinstance(log, Log) else log)
     first = next(pieces, Log())
-    partial = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
+    with whole_file(target) as partial:
         target.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as stream:
             _write(ChunkWriter(stream, compression), first, pieces, target, frames)
-        partial.replace(target)
-    except OSError as error:
-        raise EgolocError(f"{target}: cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):  # where nothing could be written there is nothing to clear away
-            partial.unlink(missing_ok=True)
 
 
 def _write(writer: ChunkWriter, first: Log, rest: Iterator[Log], target: Path, frames: Iterable[Frame]) -> None:
