@@ -19,6 +19,8 @@ class BevConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Half of its side, m."""
     z_m: tuple[float, float] = (-3.0, 5.0)
     """Points between these heights in body axes are used, m."""
+    ground_m: float = -0.5
+    """Where the network sees the ground under the vehicle, m; frames of other bodies are lifted so."""
     plane_height_m: float | None = None
     """Height in body axes of the plane onto which map elements are projected (Eq. S1-S4), m; None: the ground under the
     vehicle, 0: the plane through the body's origin, as the paper's goes through the LiDAR."""

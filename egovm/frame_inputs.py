@@ -1,8 +1,10 @@
-"""Frames of a log as the network takes them: points and images in body axes at the frame's own time.
+"""Frames of a log as the network takes them: points and images in lifted axes at the frame's own time.
 
-Points are brought to the frame's time by the vehicle's motion. An image stays as it was taken: the camera's pose is
-that of its exposure, told from the body at the frame's time, so that what stands is found where it appears. Images are
-rectified, resized (both axes by themselves; intrinsics follow) and normalized as the backbone was trained.
+Lifted axes are the body's, lifted along z until the ground lies where it lay in training (``BevConfig.ground_m``): what
+a thing looks like then does not depend on how high the body's origin rides. Points are brought to the frame's time by
+the vehicle's motion. An image stays as it was taken: the camera's pose is that of its exposure, told from the body at
+the frame's time, so that what stands is found where it appears. Images are rectified, resized (both axes by themselves;
+intrinsics follow) and normalized as the backbone was trained.
 """
 
 from collections.abc import Sequence
@@ -15,6 +17,7 @@ from torch import Tensor
 
 from egovm.batch import Images, Points
 from egovm.config import BevConfig, CameraConfig, NetworkConfig
+from egovm.projection import ground_under
 from egovm.timm_models import normalization
 from sensors.errors import EgolocError
 from sensors.frames import Frame
@@ -35,15 +38,20 @@ class FrameInputs(NamedTuple):
 
 
 def frame_inputs(
-    frames: Sequence[Frame], config: NetworkConfig, motions: Sequence[Motion] | None = None
+    frames: Sequence[Frame],
+    config: NetworkConfig,
+    motions: Sequence[Motion] | None = None,
+    lifts: Sequence[float] | None = None,
 ) -> FrameInputs:
-    """Frames for a network, one batch. motions: of each frame; None: the vehicle stood.
+    """Frames for a network, one batch. motions: of each; None: the vehicle stood. lifts: ``lift_of`` each, m; None: 0.
+
 
     Cameras go by name, in the order in which they first appear; where a frame lacks one, its image is not valid.
     Raises EgolocError for no frames, a motion that does not cover its frame, and images that cannot be decoded.
     """
     moved = [Standing()] * len(frames) if motions is None else motions
-    if not frames or len(moved) != len(frames):
+    lifted = [0.0] * len(frames) if lifts is None else lifts
+    if not frames or len(moved) != len(frames) or len(lifted) != len(frames):
         raise EgolocError(f"frames: expected one or more and a motion for each, got {len(frames)} and {len(moved)}")
     for frame, motion in zip(frames, moved, strict=True):
         first, last = span_of(frame)
@@ -51,25 +59,36 @@ def frame_inputs(
             raise EgolocError(f"frame at {frame.t_ns}: expected a motion known from {first} to {last} ns")
     points = images = None
     if config.lidar is not None and any(frame.sweeps for frame in frames):
-        points = lidar_points(frames, config.bev, moved)
+        points = lidar_points(frames, config.bev, moved, lifted)
     if config.camera is not None and any(frame.images for frame in frames):
-        images = camera_images(frames, config.camera, moved)
+        images = camera_images(frames, config.camera, moved, lifted)
     return FrameInputs(points, images)
 
 
-def lidar_points(frames: Sequence[Frame], bev: BevConfig, motions: Sequence[Motion]) -> Points:
+def lift_of(frame: Frame, bev: BevConfig, ground_m: float | None = None) -> float:
+    """How far a frame's body axes are lifted to become lifted axes, m.
+
+    ground_m: height of the ground under the vehicle in body axes, m; None: that which its points show
+    (``projection.ground_under``), and where they show none the network's own, so that nothing is lifted.
+    """
+    if ground_m is None and frame.sweeps:
+        ground_m = ground_under(np.concatenate([sweep.in_body() for sweep in frame.sweeps]))
+    return 0.0 if ground_m is None else bev.ground_m - ground_m
+
+
+def lidar_points(frames: Sequence[Frame], bev: BevConfig, motions: Sequence[Motion], lifts: Sequence[float]) -> Points:
     """The points over the BEV plane, at the heights that are used, of all sweeps."""
-    parts = [_points(frame, bev, motion) for frame, motion in zip(frames, motions, strict=True)]
+    parts = [_points(*each, bev) for each in zip(frames, motions, lifts, strict=True)]
     rows = torch.from_numpy(np.concatenate(parts).astype(np.float32))
     which = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor([len(part) for part in parts]))
     return Points(rows[:, :3], rows[:, 3], rows[:, 4], which, len(parts))
 
 
-def _points(frame: Frame, bev: BevConfig, motion: Motion) -> Floats:
+def _points(frame: Frame, motion: Motion, lift: float, bev: BevConfig) -> Floats:
     """(P, 5) x y z m, intensity 0..1 and s from the frame's time, of one frame."""
     found = [np.empty((0, 5))]
     for sweep in frame.sweeps:
-        xyz = points_at(sweep, frame.t_ns, motion, frame.t_ns)
+        xyz = points_at(sweep, frame.t_ns, motion, frame.t_ns) + np.array((0.0, 0.0, lift))
         intensity = np.clip(np.nan_to_num(sweep.intensity.astype(np.float64)) / FULL_INTENSITY, 0.0, 1.0)
         rows = np.column_stack((xyz, intensity, sweep.offset_ns * 1e-9))
         low, high = bev.z_m
@@ -78,7 +97,9 @@ def _points(frame: Frame, bev: BevConfig, motion: Motion) -> Floats:
     return np.concatenate(found)
 
 
-def camera_images(frames: Sequence[Frame], camera: CameraConfig, motions: Sequence[Motion]) -> Images:
+def camera_images(
+    frames: Sequence[Frame], camera: CameraConfig, motions: Sequence[Motion], lifts: Sequence[float]
+) -> Images:
     """The images of all cameras."""
     names = list(dict.fromkeys(image.name for frame in frames for image in frame.images))
     shape = len(frames), len(names)
@@ -87,14 +108,23 @@ def camera_images(frames: Sequence[Frame], camera: CameraConfig, motions: Sequen
     K, T = torch.eye(3).repeat(*shape, 1, 1), torch.eye(4).repeat(*shape, 1, 1)
     valid = torch.zeros(shape, dtype=torch.bool)
     mean, deviation = (torch.tensor(values)[:, None, None] for values in normalization(camera.backbone))
-    for b, (frame, motion) in enumerate(zip(frames, motions, strict=True)):
+    for b, (frame, motion, lift) in enumerate(zip(frames, motions, lifts, strict=True)):
         for image in frame.images:
             n = names.index(image.name)
             rgb[b, n] = (_pixels(image, height, width) - mean) / deviation
             K[b, n] = torch.from_numpy(_scaled(image, height, width))
-            T[b, n] = torch.from_numpy(image.T_camera_body @ relative(motion, frame.t_ns, image.t_ns))
+            T[b, n] = torch.from_numpy(
+                image.T_camera_body @ relative(motion, frame.t_ns, image.t_ns) @ lifted_axes(lift)
+            )
             valid[b, n] = True
     return Images(rgb, K, T, valid)
+
+
+def lifted_axes(lift: float) -> Floats:
+    """(4, 4) T_body_lifted: the lifted origin lies so far below the body's, m."""
+    T = np.eye(4)
+    T[2, 3] = -lift
+    return T
 
 
 def _pixels(image: Image, height: int, width: int) -> Tensor:

@@ -24,6 +24,8 @@ log = logging.getLogger(__name__)
 
 _SHORTEST_M = 0.05
 """Shorter rests of segments that the edge of the BEV cuts off are dropped, m."""
+_LEVEL = 0.9
+"""Cosine of the tilt up to which a surfel counts as ground: it says nothing of x, y and yaw."""
 _COLUMNS = ("type", "ends", "height", "normal", "ratios")
 
 
@@ -211,8 +213,9 @@ def _ground_below(elements: Elements, xy: Floats) -> Floats:
 
 
 def _surfels(surfels: Surfels, T_map_body: Floats, height_m: float, half_m: float) -> Pieces:
-    """Surfels with normals in body axes: of walls towards the vehicle, for a map's normals only point upwards."""
-    near = np.flatnonzero((np.abs(surfels.p - T_map_body[:2, 3]) < 1.5 * half_m).all(axis=1))
+    """Surfels of what stands, their normals in body axes, towards the vehicle: a map's only point upwards."""
+    close = (np.abs(surfels.p - T_map_body[:2, 3]) < 1.5 * half_m).all(axis=1)
+    near = np.flatnonzero(close & (np.abs(surfels.normal[:, 2]) < _LEVEL))
     xy = on_plane(surfels.p[near], T_map_body, height_m)
     inside = (np.abs(xy) <= half_m).all(axis=1)
     near, xy = near[inside], xy[inside]

@@ -81,7 +81,7 @@ def test_a_place_is_where_the_recorded_image_has_it() -> None:
     taken = Image(bytes(640 * 400 * 3), "rgb8", 640, 400, K, AHEAD, T0 - 40_000_000, "front")
     moved = ConstantVelocity((12.0, 0.0, 0.0), (0.0, 0.0, 0.4))
     camera = CameraConfig(image_hw=(96, 224))
-    found = camera_images([Frame(T0, T0, (), (taken,))], camera, [moved])
+    found = camera_images([Frame(T0, T0, (), (taken,))], camera, [moved], [0.0])
     places = np.array([[12.0, 3.0, 0.4], [25.0, -6.0, 2.0], [8.0, 0.0, 0.0]])
     pixels, inside = project(torch.tensor(places, dtype=torch.float32), found)
     seen = taken.seen(moved.carried(places, T0, taken.t_ns))
@@ -97,7 +97,7 @@ def test_colours_are_normalized_means_of_the_pixels() -> None:
     rgb[:, :96] = 0
     taken = image(T0, kind="rgb8", data=rgb.tobytes(), width=192, height=96)
     config = CameraConfig(backbone="mobilenetv3_small_100", image_hw=(32, 64))
-    found = camera_images([Frame(T0, T0, (), (taken,))], config, [Standing()]).rgb[0, 0]
+    found = camera_images([Frame(T0, T0, (), (taken,))], config, [Standing()], [0.0]).rgb[0, 0]
     mean, deviation = map(np.array, normalization(config.backbone))
     np.testing.assert_allclose(found[:, 16, 5], -mean / deviation, rtol=1e-5)
     np.testing.assert_allclose(found[:, 16, 60], (1.0 - mean) / deviation, rtol=1e-5)
@@ -116,7 +116,10 @@ def test_a_lens_is_taken_out() -> None:
     rgb = np.zeros((128, 192, 3), np.uint8)
     rgb[row - 1 : row + 2, column - 1 : column + 2] = 255
     found = camera_images(
-        [Frame(T0, T0, (), (replace(blank, data=rgb.tobytes()),))], CameraConfig(image_hw=(128, 192)), [Standing()]
+        [Frame(T0, T0, (), (replace(blank, data=rgb.tobytes()),))],
+        CameraConfig(image_hw=(128, 192)),
+        [Standing()],
+        [0.0],
     )
     brightest = np.array(np.unravel_index(int(found.rgb[0, 0].sum(0).argmax()), (128, 192)))
     pixels, _ = project(torch.tensor(place, dtype=torch.float32), found)

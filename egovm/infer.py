@@ -1,0 +1,101 @@
+"""A trained network at work: Matcher, one frame against the map around an initial pose."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from egovm.batch import Batch
+from egovm.convolutions import deployed
+from egovm.frame_inputs import frame_inputs, lift_of, lifted_axes
+from egovm.map_elements import Pieces, padded, pieces_around
+from egovm.match import NO_DATA, Match, answer_of, nothing
+from egovm.network import EgoVM, Output
+from egovm.pose_solver import PoseEstimate
+from egovm.weights import load_weights, read_config
+from sensors.errors import EgolocError
+from sensors.frames import Frame
+from sensors.maps.map_file import MapFile
+from sensors.motion import Motion, Standing
+from sensors.rotation import check_rigid
+
+Floats = NDArray[np.float64]
+
+
+class Matcher:
+    """Matcher(weights)(frame, vector_map, T_map_init) -> Match. Not for several threads at once."""
+
+    def __init__(self, weights: Path) -> None:
+        """weights: a safetensors file with its config beside it, and its calibration where it has one.
+
+        Raises EgolocError where they cannot be read or do not fit each other, and for a network that regresses the pose
+        (A6): it states no covariance.
+        """
+        self.config = read_config(weights)
+        if self.config.ablation.solver != "histogram":
+            raise EgolocError(f"{weights}: ablation: solver: expected histogram, for regression states no covariance")
+        network = EgoVM(self.config)
+        load_weights(network, weights)
+        self._network: Any = deployed(network)
+        self._map_m = 1.5 * self.config.bev.half_m
+
+    def __call__(
+        self,
+        frame: Frame,
+        vector_map: MapFile,
+        T_map_init: ArrayLike,
+        motion: Motion | None = None,
+        *,
+        ground_m: float | None = None,
+        search: ArrayLike | None = None,
+        semantics: bool = False,
+    ) -> Match:
+        """Match a frame around an initial pose (4, 4) of the body at its t_ns, in the map's frame.
+
+        motion: around the frame; None: the vehicle stood. ground_m: height of the ground under the vehicle in body
+        axes, m; None: as its points show. search: (3,) m, m, rad, half of what a prior leaves to be searched, which
+        narrows the search only. semantics: the output has the semantic maps as well.
+        Raises EgolocError for an initial pose that is none or not upright, and images that cannot be decoded.
+        """
+        begin = time.perf_counter()
+        T_map_init = np.asarray(T_map_init, np.float64)
+        check_rigid("T_map_init", T_map_init)
+        lift = lift_of(frame, self.config.bev, ground_m)
+        T_body_lifted = lifted_axes(lift)
+        pieces = self._pieces(vector_map, T_map_init @ T_body_lifted)
+        inputs = frame_inputs([frame], self.config, [motion or Standing()], [lift])
+        batch = output = None
+        lattice = self.config.solver.lattice
+        if inputs.points is None and inputs.images is None:
+            answer = nothing(NO_DATA, T_map_init, lattice.levels, len(pieces))
+        else:
+            batch = Batch(inputs.points, inputs.images, padded([pieces]))
+            output = self._run(batch, search, semantics=semantics)
+            assert isinstance(output.estimate, PoseEstimate)
+            answer = answer_of(output.estimate, T_map_init, T_body_lifted, lattice)
+            answer = answer._replace(contribution=answer.contribution[: len(pieces)])
+        return Match(
+            t_ns=frame.t_ns,
+            arrival_ns=frame.arrival_ns,
+            T_map_init=T_map_init,
+            T_body_lifted=T_body_lifted,
+            seconds=time.perf_counter() - begin,
+            pieces=pieces,
+            batch=batch,
+            output=output,
+            **answer._asdict(),
+        )
+
+    def _pieces(self, vector_map: MapFile, T_map_lifted: Floats) -> Pieces:
+        x, y = T_map_lifted[:2, 3].tolist()
+        elements, surfels = vector_map.around(x, y, self._map_m)
+        return pieces_around(elements, surfels, T_map_lifted, self.config, self.config.bev.ground_m)
+
+    @torch.inference_mode()
+    def _run(self, batch: Batch, search: ArrayLike | None, *, semantics: bool) -> Output:
+        prior = None if search is None else torch.from_numpy(np.asarray(search, np.float32)[None])
+        output: Output = self._network(batch, prior, semantics=semantics)
+        return output
