@@ -10,24 +10,26 @@ from egovm.batch import SURFEL, TYPES, Truth
 from egovm.config import PRESETS, Ablation
 from egovm.dataset import (
     NOISES,
+    Augmentation,
     EvaluationBatches,
     InitialNoise,
     TrainingBatches,
     batched,
     planar,
     seen_from_off,
+    thinned,
     turned,
 )
 from egovm.judging import judged
 from egovm.lattice import seen_from
 from egovm.losses import LossConfig, network_losses
 from egovm.made_samples import made_sample
-from egovm.map_elements import places_of
+from egovm.map_elements import Pieces, places_of
 from egovm.pose_solver import PoseSolver
 from egovm.sample import Sample
 from sensors.maps.vector_map import NO_SURFELS, Kind
 from tests.egovm.made_map import made
-from tests.egovm.made_training import NETWORK, RECIPE, made_cache
+from tests.egovm.made_training import NETWORK, RECIPE, STILL, made_cache
 
 __all__ = ["made_cache"]
 
@@ -125,7 +127,7 @@ def test_noise_is_as_wide_as_said(name: str) -> None:
 
 
 def training(cache: Path, seed: int = 0) -> TrainingBatches:
-    return TrainingBatches(RECIPE, NETWORK, InitialNoise(), 2, 5.0, seed, cache)
+    return TrainingBatches(RECIPE, NETWORK, InitialNoise(), Augmentation(turn_deg=5.0), 2, seed, cache)
 
 
 def test_batches_are_of_the_seed_and_the_step(made_cache: Path) -> None:
@@ -144,6 +146,20 @@ def test_every_sample_comes_once_an_epoch(made_cache: Path) -> None:
     sizes = [sorted(_sizes(training(made_cache), steps)) for steps in ((0, 1), (2, 3))]
     assert sizes[0] == sizes[1]
     assert len(set(sizes[0])) == RECIPE.samples
+
+
+def test_some_maps_lack_surfels_or_a_kind_but_never_all() -> None:
+    types = np.repeat(np.arange(TYPES), 2)
+    rows = len(types)
+    zeros = np.zeros((rows, 2, 3), np.float32), np.zeros(rows, np.float32), np.zeros((rows, 3), np.float32)
+    pieces = Pieces(types, *zeros, np.zeros((rows, 2), np.float32))
+    rng = np.random.default_rng(2)
+    found = [set(thinned(pieces, Augmentation(drop_surfels=0.5, drop_kinds=0.2), rng).type) for _ in range(400)]
+    share = [np.mean([kind not in one for one in found]) for kind in range(TYPES)]
+    assert share[SURFEL] == pytest.approx(0.5, abs=0.1)
+    assert share[:SURFEL] == pytest.approx([0.2] * SURFEL, abs=0.08)
+    assert len(thinned(pieces, Augmentation(drop_surfels=1.0, drop_kinds=1.0), rng)) == rows
+    assert len(thinned(pieces, STILL, rng)) == rows
 
 
 def _sizes(batches: TrainingBatches, steps: tuple[int, ...]) -> list[int]:
