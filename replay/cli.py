@@ -19,6 +19,7 @@ from replay.commands.map_check import CheckMap
 from replay.commands.map_files import ExportMap, ImportMap
 from replay.commands.mapping import MapInfo
 from replay.commands.noise import Allan, Noise
+from replay.commands.predicting import Predict
 from replay.commands.replaying import Replay
 from replay.commands.surveying import Align, Surfels
 from replay.commands.training import Evaluate, Train
@@ -38,6 +39,7 @@ COMMANDS = {
     "noise": Noise,
     "train": Train,
     "eval": Evaluate,
+    "predict": Predict,
 }
 MAPS = {
     "import": ImportMap,
