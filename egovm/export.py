@@ -1,4 +1,4 @@
-"""A trained network as ONNX, for runtimes other than PyTorch: the graph of one mode, and in it what its users must know.
+"""A trained network as ONNX, for runtimes other than PyTorch: the graph of one mode, and what its users must know.
 
 Needs the extra ``export`` (onnx, onnxscript, onnxruntime).
 """
@@ -6,7 +6,7 @@ Needs the extra ``export`` (onnx, onnxscript, onnxruntime).
 import io
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -38,18 +38,25 @@ def check_installed() -> None:
         raise EgolocError(f"export: expected {', '.join(missing)}, not installed: pip install egoloc[export]")
 
 
-def write_onnx(network: nn.Module, config: NetworkConfig, mode: Mode, sample: Inputs, path: Path) -> None:
+def write_onnx(
+    network: nn.Module,
+    config: NetworkConfig,
+    mode: Mode,
+    sample: Inputs,
+    path: Path,
+    notes: Mapping[str, str] | None = None,
+) -> None:
     """Write the graph of a mode.
 
-    network: an EgoVM in evaluation, best ``deployed``; sample: inputs of that mode, two or more of all that stays open.
-    What is written does not depend on their values or numbers.
+    network: an EgoVM in evaluation, best ``deployed``; sample: inputs of that mode, two or more of all that stays open:
+    what is written does not depend on their values or numbers; notes: what else the file tells, beside ``metadata``.
     """
     import onnx
 
     model = _converted(FrameGraph(network).eval(), sample, mode)
     _anonymous(model.graph)
     _open_named(model.graph)
-    for key, value in metadata(config, mode).items():
+    for key, value in (metadata(config, mode) | dict(notes or {})).items():
         entry = model.metadata_props.add()
         entry.key, entry.value = f"egoloc.{key}", value
     model.producer_name, model.producer_version = "egoloc", version("egoloc")

@@ -94,6 +94,6 @@ def batch_of(inputs: Inputs) -> Batch:
     points = None
     if own["points"]:
         nothing = torch.zeros_like(own["points"]["intensity"])
-        points = Points(**own["points"], offset_s=nothing, frame=nothing.to(torch.int64))
+        points = Points(own["points"]["xyz"], own["points"]["intensity"], nothing, nothing.to(torch.int64))
     images = Images(**own["images"]) if own["images"] else None
     return Batch(points, images, MapElements(**own["elements"]))

@@ -19,6 +19,7 @@ from egovm.solver_dots import chunks
 from egovm.solver_modes import two_modes
 from egovm.solver_window import Window, dot_window, dots_at, lattice_dots, summed_lattice_dots
 
+
 @dataclass(frozen=True, slots=True)
 class LevelEstimate:
     """What one level says, about its centre.

@@ -112,11 +112,12 @@ def _split(channels: Tensor, groups: int) -> Tensor:
 
 
 def exporting() -> bool:
-    """Whether a graph is being made for elsewhere, in which numbers of elements stay open."""
+    """Whether a graph is being made for elsewhere."""
     return torch.compiler.is_exporting() or torch.onnx.is_in_onnx_export()
 
 
 def chunks(points: int) -> list[slice]:
+    """Parts of so many points or elements that go through memory at once; in exports all, for their number is open."""
     if exporting():
         return [slice(None)]
     return [slice(s, min(s + _CHUNK, points)) for s in range(0, max(points, 1), _CHUNK)]

@@ -50,15 +50,17 @@ class Export:
 
         path = weights_path(self.weights)
         check_new(self.target, [path], overwrite=self.overwrite)
+        if not self.target.parent.is_dir():
+            raise EgolocError(f"{self.target.parent}: expected a folder to write into, found none")
         config = read_config(path)
         mode = chosen_mode(config, self.mode)
-        network = EgoVM(config)
-        load_weights(network, path)
-        network = deployed(network)
+        trained = EgoVM(config)
+        load_weights(trained, path)
+        network = deployed(trained)
         with stage(f"exporting {path.name}, {mode}") as say:
             frames = list(sample_frames(config, mode))
             with whole_file(self.target) as partial:
-                write_onnx(network, config, mode, frames[0][1], partial)
+                write_onnx(network, config, mode, frames[0][1], partial, {"weights": path.name})
                 say("comparing")
                 found = differences(network, partial, frames)
                 check_differences(found, self.target)
