@@ -5,6 +5,7 @@ The simulation draws no images; noise tells as well whether two runtimes compute
 
 import math
 from collections.abc import Iterator
+from dataclasses import fields
 
 import msgspec
 import torch
@@ -31,7 +32,8 @@ def sample_frames(config: NetworkConfig, mode: Mode) -> Iterator[tuple[str, Inpu
     for number, cameras in enumerate(CAMERAS):
         seen = batches[number][0]
         images = None if config.camera is None else noise_images(config.camera, cameras, number)
-        yield f"frame {number + 1}", inputs_of(Batch(seen.points, images, seen.elements), mode)
+        elements = _some_more(seen.elements) if number == 0 else _nearer_half(seen.elements)
+        yield f"frame {number + 1}", inputs_of(Batch(seen.points, images, elements), mode)
     yield "an empty frame", inputs_of(empty_frame(config), mode)
 
 
@@ -54,6 +56,21 @@ def empty_frame(config: NetworkConfig) -> Batch:
     type_ = torch.zeros(1, 1, dtype=torch.int64)
     ends, height, normal, ratios = (torch.zeros(1, 1, *shape) for shape in ((2, 3), (), (3,), (2,)))
     return Batch(points, images, MapElements(type_, ends, height, normal, ratios, type_ > 0))
+
+
+def _some_more(elements: MapElements) -> MapElements:
+    """With two rows of padding: where a map has fewer, numbers are as many as an export needs."""
+    padded = {}
+    for field in fields(elements):
+        value = getattr(elements, field.name)
+        padded[field.name] = torch.cat((value, value.new_zeros(1, 2, *value.shape[2:])), 1)
+    return MapElements(**padded)
+
+
+def _nearer_half(elements: MapElements) -> MapElements:
+    """Networks with few places have as many elements in all frames."""
+    half = (elements.valid.shape[1] + 1) // 2
+    return MapElements(**{field.name: getattr(elements, field.name)[:, :half] for field in fields(elements)})
 
 
 def _camera(yaw: float) -> Tensor:

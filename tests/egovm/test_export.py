@@ -15,10 +15,20 @@ from egovm.config import SMALL, BevConfig, LatticeConfig, MatchingConfig, Networ
 from egovm.convolutions import deployed
 from egovm.export import metadata, write_onnx
 from egovm.export_check import LIMITS, Session, answers, apart, check_differences
-from egovm.export_graph import OUTPUTS, FrameGraph, Inputs, Mode, batch_of, chosen_mode, inputs_of, names_of
+from egovm.export_graph import (
+    OUTPUTS,
+    FrameGraph,
+    Inputs,
+    Mode,
+    batch_of,
+    chosen_mode,
+    inputs_of,
+    names_of,
+    open_dimension,
+)
+from egovm.export_sample import sample_frames
 from egovm.network import EgoVM
 from egovm.timm_models import normalization
-from egovm.weights import save_weights
 from replay import cli
 from replay.commands.exporting import Export
 from sensors.errors import EgolocError
@@ -34,6 +44,9 @@ ONE_LEVEL = msgspec.structs.replace(
     lidar=msgspec.structs.replace(LIDAR.lidar, channels=(8, 8), blocks=(1, 1)),
     solver=SolverConfig(LatticeConfig(levels=1)),
 )
+
+
+ROOT = Path(cli.__file__).parents[1]
 
 
 def network(config: NetworkConfig) -> torch.nn.Module:
@@ -247,12 +260,13 @@ def test_without_the_extra_it_says_how_to_get_it(
 
 
 @pytest.mark.slow
-def test_the_weights_that_come_with_egoloc(
-    egoloc: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_weights_that_come_with_egoloc_and_the_example_of_the_docs(
+    egoloc: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
-    path = tmp_path / "a.onnx"
+    monkeypatch.chdir(tmp_path)
+    path = Path("small-lidar.onnx")
     assert egoloc("small-lidar", path, "--json") == 0
     report = msgspec.json.decode(capsys.readouterr().out)
     assert report["mode"] == "lidar"
@@ -262,31 +276,29 @@ def test_the_weights_that_come_with_egoloc(
     model = onnx.load(path)
     assert [each.name for each in model.graph.input] == list(names_of("lidar"))
     assert [each.name for each in model.graph.output] == list(OUTPUTS)
-    assert {entry.key for entry in model.metadata_props} >= {"egoloc.version", "egoloc.config", "egoloc.axes"}
-    assert str(Path(cli.__file__).parent.parent).encode() not in path.read_bytes()
-
-
-@pytest.mark.slow
-def test_the_example_of_the_docs_runs(
-    egoloc: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It prints the offset that it found, and the true one."""
-    pytest.importorskip("onnxruntime")
-    text = (Path(cli.__file__).parents[1] / "docs" / "export.md").read_text()
-    _, _, code = text.partition("```python\n")
-    monkeypatch.chdir(tmp_path)
-    assert egoloc("small-lidar", "small-lidar.onnx") == 0
-    capsys.readouterr()
-    exec(code.partition("```")[0], {})
-    found, true = ([float(x) for x in line.split()[1:4]] for line in capsys.readouterr().out.splitlines()[:2])
+    assert {entry.key for entry in model.metadata_props} >= {"egoloc.version", "egoloc.config", "egoloc.weights"}
+    assert str(ROOT).encode() not in path.read_bytes()
+    found, true = example_of_the_docs(capsys)
     np.testing.assert_allclose(found, true, atol=0.1)  # m, m, deg
     assert np.abs(true).max() > 0.5
 
 
-@pytest.mark.slow
-def test_weights_with_cameras_by_the_command(egoloc: Callable[..., int], tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime")
-    torch.manual_seed(0)
-    save_weights(EgoVM(WHOLE), WHOLE, tmp_path / "w.safetensors")
-    assert egoloc(tmp_path / "w.safetensors", tmp_path / "a.onnx", "--mode", "visual") == 0
-    assert (tmp_path / "a.onnx").is_file()
+def example_of_the_docs(capsys: pytest.CaptureFixture[str]) -> list[list[float]]:
+    """The offset that it finds, and the true one."""
+    _, _, code = (ROOT / "docs" / "export.md").read_text().partition("```python\n")
+    exec(code.partition("```")[0], {})
+    return [[float(x) for x in line.split()[1:4]] for line in capsys.readouterr().out.splitlines()[:2]]
+
+
+@pytest.mark.parametrize("mode", get_args(Mode))
+def test_sample_frames_are_inputs_of_their_mode(mode: Mode) -> None:
+    """Of a network without a LiDAR, too; and the network takes them."""
+    config = WHOLE if mode != "visual" else msgspec.structs.replace(WHOLE, lidar=None)
+    made, frames = network(config), dict(sample_frames(config, mode))
+    assert [tuple(inputs) for inputs in frames.values()] == 3 * [names_of(mode)]
+    sizes = [[value.shape[open_dimension(name)] for name, value in inputs.items()] for inputs in frames.values()]
+    assert min(sizes[0]) >= 2
+    assert all(a != b for a, b in zip(*sizes[:2], strict=True))
+    found = [answers(made, inputs) for inputs in frames.values()]
+    assert np.isfinite(found[0]["cov"]).all()
+    assert not found[2]["landmarks"].any()
