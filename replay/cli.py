@@ -12,6 +12,7 @@ import tyro
 from replay.commands.benchmarks import BENCHMARKS
 from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
+from replay.commands.exporting import Export
 from replay.commands.frames import Frames
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
@@ -40,6 +41,7 @@ COMMANDS = {
     "train": Train,
     "eval": Evaluate,
     "predict": Predict,
+    "export": Export,
 }
 MAPS = {
     "import": ImportMap,
