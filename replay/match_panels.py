@@ -1,6 +1,7 @@
 """The panels of a match's picture: forward is up, left is left, and every place is drawn to scale."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,29 +11,37 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from egovm.batch import SURFEL
 from egovm.projection import plane_height
 from replay.match_drawing import (
+    ABOVE_M,
     AGAINST,
+    CLOSE_M,
     COLOURS,
     FOR,
+    HEIGHTS,
     NEUTRAL,
-    Histogram,
     Pictured,
-    array,
-    basis_of,
-    coloured,
     ends_at,
-    estimate_of,
     estimated_offset,
+    heights_shaded,
     offset_of,
-    planes_of,
     points_of,
-    semantic_colours,
 )
 from replay.match_images import on_image
+from replay.match_levels import (
+    SIGMAS,
+    Histogram,
+    basis_of,
+    coloured,
+    ellipse,
+    planes_of,
+    semantic_colours,
+    shares,
+)
 from sensors.images import Image
 from sensors.maps.vector_map import Kind
 
@@ -40,17 +49,11 @@ Floats = NDArray[np.float64]
 
 GROUND = "#101418"
 """Behind everything that is seen from above."""
-CLOSE_M = 20.0
-"""The map before and after is shown this far around the vehicle: farther, an offset is too small to be seen."""
-ABOVE_M = (-0.3, 4.0)
-"""Heights above the ground that become dark and bright."""
-HEIGHTS = "cividis"
 MASS = "magma"
-SIGMAS = 2.0
-"""Ellipses and bands are so many sigmas wide to each side."""
-DARKEST = 0.25
-"""Of what the scales of points begin with, so that no point vanishes in the ground."""
 STRENGTH = LinearSegmentedColormap.from_list("strength", (AGAINST, NEUTRAL, FOR))
+OUTLINED = [withStroke(linewidth=2.0, foreground="black")]
+STANDING: Mapping[int, tuple[str, float]] = {Kind.POLE: ("o", 16.0), Kind.SIGN: ("s", 20.0), SURFEL: ("o", 3.0)}
+"""Symbol and area, in square points, of what is no line."""
 VEHICLE = np.array([(1.9, 0.0), (-1.4, 0.95), (-0.8, 0.0), (-1.4, -0.95)])
 """An arrow about as long as a car."""
 
@@ -90,7 +93,7 @@ def points_panel(figure: Any, place: Any, pictured: Pictured) -> None:
     height = points[:, 2] - plane_height(pictured.bev, pictured.bev.ground_m)
     order = np.argsort(height, kind="stable")
     scale = ScalarMappable(Normalize(*ABOVE_M), HEIGHTS)
-    axes.scatter(points[order, 1], points[order, 0], c=_shade(height[order]), s=1.0, linewidths=0)
+    axes.scatter(points[order, 1], points[order, 0], c=heights_shaded(height[order]), s=1.0, linewidths=0)
     _bar(axes, scale, [0, 1, 2, 3, 4], "m above the ground")
     _box(axes, min(CLOSE_M, half))
 
@@ -127,31 +130,24 @@ def semantic_panel(figure: Any, place: Any, pictured: Pictured, level: int) -> N
 
 
 def contribution_panel(figure: Any, place: Any, pictured: Pictured, level: int) -> None:
-    """The pieces at the estimated pose, by what the level's score would lose without each."""
-    match = pictured.match
-    estimate = estimate_of(match)
-    assert estimate is not None
-    axes = _from_above(figure, place, _half_m(pictured), f"Share of the score {level}: {match.landmarks[level]} pieces")
-    found = estimate.levels[level]
-    kept = len(match.pieces)
-    used, added = found.window.valid[0, :kept].cpu().numpy(), array(found.contribution[0, :kept])
-    total = np.abs(added).sum()
-    share = 100.0 * added / total if total > 0.0 else added
-    most = float(np.percentile(np.abs(share[used]), 95.0)) if used.any() else 1.0
-    scale = ScalarMappable(Normalize(-most, most), STRENGTH)
-    _backdrop(axes, pictured, _half_m(pictured), 0.3)
+    """The pieces at the estimated pose, by what the level's score would lose without each, the weightiest on top."""
+    match, half = pictured.match, _half_m(pictured)
+    axes = _from_above(figure, place, half, f"Share of the score {level}: {match.landmarks[level]} pieces")
+    _backdrop(axes, pictured, half, 0.3)
+    found = shares(match)[level]
     ends = ends_at(match.pieces, estimated_offset(match))
-    rows = np.flatnonzero(used)
-    rows = rows[np.argsort(np.abs(share[rows]), kind="stable")]
+    scale = ScalarMappable(Normalize(-found.most, found.most), STRENGTH)
+    rows = np.argsort(np.abs(found.percent), kind="stable")
+    rows = rows[np.isfinite(found.percent[rows])]
     for kind in COLOURS:
         chosen = rows[match.pieces.type[rows] == kind]
-        _pieces(axes, ends, chosen, kind, scale.to_rgba(share[chosen]))
-    _bar(axes, scale, [-most, 0.0, most], "% of the score")
+        _pieces(axes, ends, chosen, kind, scale.to_rgba(found.percent[chosen]))
+    _bar(axes, scale, [-found.most, 0.0, found.most], "% of the score")
 
 
 def histogram_panels(figure: Any, place: Any, pictured: Pictured, level: int, found: Histogram) -> None:
     """The level's posterior over forward and left, summed over yaw, and the other way round below it."""
-    above, below = place.subgridspec(2, 1, height_ratios=[3.2, 1.0])
+    above, below = place.subgridspec(2, 1, height_ratios=[4.0, 1.0])
     _mass_panel(figure.add_subplot(above), pictured, level, found)
     _yaw_panel(figure.add_subplot(below), pictured, found)
 
@@ -205,8 +201,8 @@ def _pieces(axes: Any, ends: Floats, rows: NDArray[np.int64], kind: int, colours
     if not len(rows):
         return
     xy = ends[rows][:, :, 1::-1]
-    if kind in (Kind.POLE, Kind.SIGN, SURFEL):
-        symbol, size = {Kind.POLE: ("o", 16.0), Kind.SIGN: ("s", 20.0)}.get(Kind(kind) if kind != SURFEL else None, ("o", 3.0))
+    if kind in STANDING:
+        symbol, size = STANDING[kind]
         axes.scatter(*xy[:, 0].T, c=colours, marker=symbol, s=size, linewidths=0, zorder=4)
     else:
         axes.add_collection(LineCollection(list(xy), colors=colours, lw=1.5, zorder=3))
@@ -214,15 +210,15 @@ def _pieces(axes: Any, ends: Floats, rows: NDArray[np.int64], kind: int, colours
 
 def _mass_panel(axes: Any, pictured: Pictured, level: int, found: Histogram) -> None:
     step = found.forward[1] - found.forward[0]
-    extent = (found.left[0] - step / 2, found.left[-1] + step / 2, found.forward[0] - step / 2, found.forward[-1] + step / 2)
-    axes.imshow(found.xy, origin="lower", extent=extent, cmap=MASS, interpolation="nearest")
-    axes.set(xlim=extent[1::-1], ylim=extent[2:], aspect="equal")
+    ends = [(along[0] - step / 2, along[-1] + step / 2) for along in (found.left, found.forward)]
+    axes.imshow(found.xy, origin="lower", extent=(*ends[0], *ends[1]), cmap=MASS, interpolation="nearest")
+    axes.set(xlim=ends[0][::-1], ylim=ends[1], aspect="equal")
     axes.set_title(f"Histogram {level}: cells of {step:g} m", fontsize=12, loc="left")
     axes.set_xlabel("offset left, m", fontsize=10, labelpad=1)
     axes.set_ylabel("offset forward, m", fontsize=10, labelpad=0)
     axes.tick_params(labelsize=9, length=2, pad=2)
     if np.isfinite(found.cov).all():
-        axes.plot(*_ellipse(found)[:, ::-1].T, color=MEAN.colour, lw=1.4)
+        axes.plot(*ellipse(found)[:, ::-1].T, color=MEAN.colour, lw=1.4)
     _marks(axes, pictured, level, found)
 
 
@@ -241,16 +237,8 @@ def _marks(axes: Any, pictured: Pictured, level: int, found: Histogram) -> None:
             if weight > 0.0:
                 place = offset_of(match, mode)[1::-1]
                 axes.plot(*place, **MODE.look(), ls="")
-                axes.annotate(f"{weight:.2f}", place, (9, 7), textcoords="offset points", fontsize=9, color=MODE.colour)
-
-
-def _ellipse(found: Histogram) -> Floats:
-    """(N, 2) forward and left on the ellipse of the covariance."""
-    angle = np.linspace(0.0, 2.0 * math.pi, 73)
-    values, axes = np.linalg.eigh(found.cov[:2, :2])
-    circle = np.stack((np.cos(angle), np.sin(angle)))
-    around: Floats = (axes * np.sqrt(values.clip(min=0.0))) @ circle * SIGMAS
-    return found.mean[:2] + around.T
+                words = {"fontsize": 10, "color": MODE.colour, "path_effects": OUTLINED}
+                axes.annotate(f"{weight:.2f}", place, (9, 7), textcoords="offset points", **words)
 
 
 def _yaw_panel(axes: Any, pictured: Pictured, found: Histogram) -> None:
@@ -268,11 +256,6 @@ def _yaw_panel(axes: Any, pictured: Pictured, found: Histogram) -> None:
     axes.set_xlabel("yaw, ° (left is positive)", fontsize=10, labelpad=1)
     axes.set_ylabel("mass", fontsize=9)
     axes.tick_params(labelsize=9, length=2, pad=2)
-
-
-def _shade(height: Floats) -> Any:
-    low, high = ABOVE_M
-    return colormaps[HEIGHTS](DARKEST + (1.0 - DARKEST) * ((height - low) / (high - low)).clip(0.0, 1.0))
 
 
 def _bar(axes: Any, scale: ScalarMappable, ticks: list[float], label: str) -> None:

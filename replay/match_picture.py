@@ -1,7 +1,6 @@
 """A match as a picture: the points, the map before and after, and what each level of the network made of them."""
 
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,8 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from replay.frame_picture import around
-from replay.match_drawing import COLOURS, Pictured, error_of, estimated_offset, histograms, kind_name, planes_of, sigmas
+from replay.match_drawing import COLOURS, Pictured, estimated_offset, kind_name, title
+from replay.match_levels import histograms, planes_of
 from replay.match_panels import (
     ESTIMATE,
     MEAN,
@@ -27,7 +27,7 @@ from replay.match_panels import (
     points_panel,
     semantic_panel,
 )
-from sensors.clock import NS_PER_S
+from sensors.images import Image
 from sensors.whole_file import whole_file
 
 Floats = NDArray[np.float64]
@@ -35,6 +35,8 @@ Floats = NDArray[np.float64]
 PANEL_IN = 3.9
 """Side of a panel, inches."""
 IMAGES_BY_ROW = 4
+LEGEND_IN = 1.65
+"""Width of an entry of the legend, inches."""
 DPI = 100
 HEAD_IN, FOOT_IN = 0.75, 0.75
 """Room for the title and the legend, inches."""
@@ -47,24 +49,22 @@ def draw_match(pictured: Pictured, path: Path) -> None:
     them, what each piece adds to the score, and the histogram. Below them the images of the frame, where it has any.
     """
     columns = _columns(pictured)
-    images = [image for row in around(pictured.frame.images) for image in row] if pictured.frame else []
+    pairs = _pairs(pictured)
     rows = max(len(column) for column in columns)
-    across = min(len(images), IMAGES_BY_ROW)
-    width = (PANEL_IN + 0.5) * len(columns)
-    shown_in = _images_in(pictured, width / across) * -(-len(images) // across) * 2 if images else 0.0
-    height = (PANEL_IN + 0.5) * rows
-    figure = Figure(figsize=(width, height + shown_in + HEAD_IN + FOOT_IN), layout="constrained")
+    width, height = (PANEL_IN + 0.5) * len(columns), (PANEL_IN + 0.5) * rows
+    below = len(pairs) * _image_in(pictured, width / len(pairs[0])) if pairs else 0.0
+    whole = height + below + HEAD_IN + FOOT_IN
+    figure = Figure(figsize=(width, whole), layout="constrained")
     FigureCanvasAgg(figure)
-    whole = height + shown_in + HEAD_IN + FOOT_IN
-    figure.get_layout_engine().set(h_pad=0.08, rect=(0.0, FOOT_IN / whole, 1.0, 1.0 - (HEAD_IN + FOOT_IN) / whole))
-    parts = figure.subfigures(2, 1, height_ratios=[height, shown_in]) if images else [figure]
+    figure.get_layout_engine().set(hspace=0.05, rect=(0.0, FOOT_IN / whole, 1.0, 1.0 - (HEAD_IN + FOOT_IN) / whole))
+    parts = figure.subfigures(2, 1, height_ratios=[height, below]) if pairs else [figure]
     grid = parts[0].add_gridspec(rows, len(columns))
     for number, column in enumerate(columns):
         for row, panel in enumerate(column):
             panel(parts[0], grid[row, number])
-    if images:
-        _images(parts[1], pictured, images, across)
-    _words(figure, pictured, whole)
+    if pairs:
+        _images(parts[1], pictured, pairs)
+    _words(figure, pictured, width, whole)
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=DPI, format="png", metadata={"Software": None})
 
@@ -99,26 +99,36 @@ def _of_level(draw: Callable[..., None], *given: Any) -> Panel:
     return lambda figure, place: draw(figure, place, *given)
 
 
-def _images_in(pictured: Pictured, width: float) -> float:
+def _pairs(pictured: Pictured) -> list[list[tuple[Image, bool]]]:
+    """Rows of images, each with whether the map is drawn after rather than before: one row above the other, or of a
+    single image beside each other."""
+    images = [image for row in around(pictured.frame.images) for image in row] if pictured.frame else []
+    if len(images) == 1:
+        return [[(images[0], False), (images[0], True)]]
+    across = -(-len(images) // max(-(-len(images) // IMAGES_BY_ROW), 1))
+    begins = range(0, len(images), max(across, 1))
+    return [[(image, late) for image in images[i : i + across]] for i in begins for late in (False, True)]
+
+
+def _image_in(pictured: Pictured, width: float) -> float:
     """Height of an image that is so wide, with its title, inches."""
     assert pictured.frame is not None
     return width * max(image.height / image.width for image in pictured.frame.images) + 0.3
 
 
-def _images(figure: Any, pictured: Pictured, images: list[Any], across: int) -> None:
-    """Each image with the map before, and below it after."""
-    rows = -(-len(images) // across)
-    grid = figure.subplots(2 * rows, across, squeeze=False)
+def _images(figure: Any, pictured: Pictured, pairs: list[list[tuple[Image, bool]]]) -> None:
+    """Each image with the map before and after."""
+    grid = figure.subplots(len(pairs), len(pairs[0]), squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
     after = estimated_offset(pictured.match)
-    for number, image in enumerate(images):
-        row, column = 2 * (number // across), number % across
-        image_panel(grid[row, column], pictured, image, np.zeros(3), "initial pose")
-        image_panel(grid[row + 1, column], pictured, image, after, "estimated pose")
+    for row, panels in zip(pairs, grid, strict=True):
+        for (image, late), axes in zip(row, panels, strict=False):
+            offset, words = (after, "estimated pose") if late else (np.zeros(3), "initial pose")
+            image_panel(axes, pictured, image, offset, words)
 
 
-def _words(figure: Any, pictured: Pictured, height_in: float) -> None:
+def _words(figure: Any, pictured: Pictured, width_in: float, height_in: float) -> None:
     """The title, and the legend of everything."""
     first, second = title(pictured)
     figure.text(0.008, 1.0 - 0.12 / height_in, first, fontsize=13, weight="bold", va="top")
@@ -128,27 +138,9 @@ def _words(figure: Any, pictured: Pictured, height_in: float) -> None:
     if histograms(pictured.match):
         marks = [START, MEAN, ESTIMATE, MODE] + ([TRUTH] if pictured.truth is not None else [])
         handles += [mark.in_legend() for mark in marks]
-    legend = figure.legend(
-        handles=handles, loc="lower left", ncols=max(len(handles), 1), fontsize=11, frameon=True, facecolor="#30363d"
-    )
+    if not handles:
+        return
+    across = min(len(handles), max(int(width_in / LEGEND_IN), 1))
+    legend = figure.legend(handles=handles, loc="lower left", ncols=across, fontsize=11, facecolor="#30363d")
     for text in legend.get_texts():
         text.set_color("white")
-
-
-def title(pictured: Pictured) -> tuple[str, str]:
-    """What was found, in two lines."""
-    match = pictured.match
-    moment = datetime.fromtimestamp(match.t_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
-    used = "/".join(map(str, match.landmarks))
-    left_out = f", {match.left_out} more left out" if match.left_out else ""
-    rest = f"landmarks {used} of {len(match.pieces)}{left_out}; {1e3 * match.seconds:.0f} ms"
-    if not match.found:
-        return f"{moment} UTC: no fix, {match.reason}", rest
-    x, y, yaw = estimated_offset(match)
-    lon, lat, turn = sigmas(match)
-    moved = f"offset {x:+.3f} m forward, {y:+.3f} m left, {np.degrees(yaw):+.3f}°"
-    stated = f"sigma {lon:.3f} m lon, {lat:.3f} m lat, {np.degrees(turn):.3f}°"
-    if pictured.truth is not None:
-        forward, left, wrong = error_of(match, pictured.truth)
-        stated += f";  error {forward:+.3f} m lon, {left:+.3f} m lat, {np.degrees(wrong):+.3f}°"
-    return f"{moment} UTC:  {moved}", f"{stated};  {rest}"
