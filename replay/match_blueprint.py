@@ -4,14 +4,17 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import rerun.blueprint as rrb
 
 from replay.frame_picture import around
-from replay.match_drawing import CLOSE_M, Pictured
+from replay.match_drawing import CLOSE_M, Floats, Pictured, error_of, estimated_offset, sigmas
 
 TIMELINE = "frame_time"
 AXES = ("lon", "lat", "yaw")
 """Longitudinal and lateral in m, yaw in deg."""
+SERIES = ("offset", "sigma", "error")
+UNITS = np.array((1.0, 1.0, 180.0 / np.pi))
 BACKGROUND = (13, 16, 17)
 FIELD_OF_VIEW = math.radians(55.0)
 """Rerun's own, from top to bottom."""
@@ -29,13 +32,13 @@ def blueprint(matches: Sequence[Pictured]) -> rrb.Blueprint:
         columns.append(_column("Semantic map", shown, [f"/bev/map/{level}" for level in levels]))
     if levels:
         columns.append(_histograms(levels))
-    below = [rrb.Horizontal(*_along_time(matches), name="Along time"), *_cameras(matches)]
+    below = [rrb.Horizontal(*_plots(matches), name="Along time"), *_cameras(matches)]
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.TextDocumentView(origin="/summary", name="Match"),
             rrb.Horizontal(*columns),
             rrb.Tabs(*below, active_tab=0) if len(below) > 1 else below[0],
-            row_shares=[0.5, 4.2, 1.3],
+            row_shares=[0.6, 4.2, 1.3],
         ),
         collapse_panels=True,
     )
@@ -82,10 +85,33 @@ def _histograms(levels: range) -> Any:
     return rrb.Vertical(*rows)
 
 
-def _along_time(matches: Sequence[Pictured]) -> list[Any]:
-    shown = ["offset", "sigma"] + (["error"] if any(each.truth is not None for each in matches) else [])
-    views = [rrb.TimeSeriesView(origin=f"/{name}", name=f"{name}, m and deg") for name in shown]
-    return [*views, rrb.TimeSeriesView(origin="/landmarks", name="landmarks by level")]
+def along_time(pictured: Pictured) -> dict[str, Floats]:
+    """What came out, (3,) in m, m, deg by AXES; nothing where nothing did. error: only where the truth is known."""
+    match = pictured.match
+    if not match.found:
+        return {}
+    rows = {"offset": estimated_offset(match), "sigma": sigmas(match)}
+    if pictured.truth is not None:
+        rows["error"] = error_of(match, pictured.truth)
+    return {name: row * UNITS for name, row in rows.items()}
+
+
+def _plots(matches: Sequence[Pictured]) -> list[Any]:
+    """Plots of what there is, from 0 or around it; landmarks."""
+    rows = [along_time(each) for each in matches]
+    views = []
+    for name in SERIES:
+        values = [row[name] for row in rows if name in row]
+        if values:
+            most = 1.15 * max(float(np.abs(values).max()), 1e-3)
+            views.append(_plot(name, f"{name}, m and deg", (0.0 if name == "sigma" else -most, most)))
+    most = 1.15 * max((int(each.match.landmarks.max(initial=1)) for each in matches), default=1)
+    return [*views, _plot("landmarks", "landmarks by level", (0.0, most))]
+
+
+def _plot(entity: str, name: str, span: tuple[float, float]) -> Any:
+    axis = rrb.ScalarAxis(range=span)
+    return rrb.TimeSeriesView(origin=f"/{entity}", name=name, axis_y=axis, plot_legend=rrb.Corner2D.LeftTop)
 
 
 def _cameras(matches: Sequence[Pictured]) -> list[Any]:

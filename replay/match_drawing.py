@@ -39,7 +39,6 @@ COLOURS: Mapping[int, str] = {
 """By type of a piece, before a dark ground; told apart by those who are colour-blind as well (Okabe and Ito)."""
 AGAINST, NEUTRAL, FOR = "#ff9d2e", "#7d858f", "#3fb4ff"
 """Of what a piece adds to the score: less than nothing, nothing, much."""
-
 CLOSE_M = 20.0
 """The map before and after is shown this far around the vehicle: farther, an offset is too small to be seen."""
 ABOVE_M = (-0.3, 4.0)
@@ -106,7 +105,8 @@ def sigmas(match: Match) -> Floats:
         return np.full(3, np.inf)
     c, s = np.cos(match.pose[2]), np.sin(match.pose[2])
     axes = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
-    return np.sqrt(np.diagonal(axes.T @ match.cov @ axes))
+    found: Floats = np.sqrt(np.diagonal(axes.T @ match.cov @ axes))
+    return found
 
 
 def error_of(match: Match, truth: Floats) -> Floats:

@@ -68,28 +68,30 @@ def estimate_of(match: Match) -> PoseEstimate | None:
     return estimate if isinstance(estimate, PoseEstimate) else None
 
 
-def planes_of(match: Match) -> list[Floats]:
+def planes_of(match: Match) -> list[NDArray[np.float32]]:
     """BEV features (C, H, W) of each level; none where the network was not run."""
-    return [] if match.output is None else [array(level[0]) for level in match.output.bev]
+    return [] if match.output is None else [level[0].detach().float().cpu().numpy() for level in match.output.bev]
 
 
-def basis_of(planes: Sequence[Floats]) -> Basis:
+def basis_of(planes: Sequence[NDArray[np.float32]]) -> Basis:
     """The principal components of the features (C, H, W) of one level of some frames.
 
-    An axis points where its largest loading is positive, so that frames like each other look like each other; frames of
-    one recording share one basis.
+    An axis points to where the features' tail is longer: what is rare is bright, and frames like each other look like
+    each other. Frames of one recording share one basis.
     """
     rows = np.concatenate([plane.reshape(len(plane), -1).T for plane in planes])
-    rows = rows[:: max(len(rows) // MOST_CELLS, 1)]
+    if len(rows) > MOST_CELLS:
+        rows = rows[np.random.default_rng(0).choice(len(rows), MOST_CELLS, replace=False)]
+    rows = rows.astype(np.float64)
     mean = rows.mean(axis=0)
-    _, axes = np.linalg.eigh(np.cov(rows - mean, rowvar=False))
-    axes = axes[:, ::-1][:, :3]
-    axes = axes * np.sign(np.take_along_axis(axes, np.abs(axes).argmax(axis=0)[None], 0))
-    low, high = np.percentile((rows - mean) @ axes, SPREAD, axis=0)
-    return Basis(mean, axes, low, np.maximum(high, low + 1e-9))
+    _, axes = np.linalg.eigh(np.cov(rows, rowvar=False))
+    along = (rows - mean) @ axes[:, :-4:-1]
+    sign = np.where((along**3).sum(axis=0) < 0.0, -1.0, 1.0)
+    low, high = np.percentile(sign * along, SPREAD, axis=0)
+    return Basis(mean, sign * axes[:, :-4:-1], low, np.maximum(high, low + 1e-9))
 
 
-def coloured(plane: Floats, basis: Basis) -> NDArray[np.uint8]:
+def coloured(plane: NDArray[np.float32], basis: Basis) -> NDArray[np.uint8]:
     """(H, W, 3) the three components of features (C, H, W) as red, green and blue."""
     along = np.tensordot(basis.axes.T, plane - basis.mean[:, None, None], 1)
     shade = (along - basis.low[:, None, None]) / (basis.high - basis.low)[:, None, None]

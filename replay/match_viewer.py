@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from egovm.batch import SURFEL
 from egovm.projection import plane_height
-from replay.match_blueprint import AXES, TIMELINE, blueprint
+from replay.match_blueprint import AXES, SERIES, TIMELINE, along_time, blueprint
 from replay.match_drawing import (
     AGAINST,
     COLOURS,
@@ -23,13 +23,11 @@ from replay.match_drawing import (
     NEUTRAL,
     Pictured,
     ends_at,
-    error_of,
     estimated_offset,
     heights_shaded,
     offset_of,
     points_of,
     rgb,
-    sigmas,
     title,
 )
 from replay.match_images import on_image
@@ -55,7 +53,10 @@ BASIS_FRAMES = 8
 """Principal components are taken of so many frames, evenly along the recording, and serve for all."""
 CLEARED = ("body", "bev", "histogram", "cameras")
 """Nothing of the frame before is left there where a frame has none."""
-UNITS = np.array((1.0, 1.0, 180.0 / np.pi))
+DASH = 0.2
+"""Of a piece's length, what is drawn over a semantic map."""
+SERIES_COLOURS = ((86, 180, 233), (230, 159, 0), (204, 121, 167))
+"""Of the axes, and of the levels."""
 _KINDS = {"jpeg": "image/jpeg", "png": "image/png"}
 
 
@@ -66,15 +67,22 @@ def write_matches(matches: Sequence[Pictured], path: Path) -> None:
         recording = rr.RecordingStream("egoloc_matches")
         recording.save(partial, default_blueprint=blueprint(matches))
         recording.log("body", rr.ViewCoordinates.FLU, static=True)
-        for axis in AXES:
-            for series in ("offset", "sigma", "error"):
-                recording.log(f"{series}/{axis}", rr.SeriesPoints(markers="circle", marker_sizes=3.0), static=True)
+        _series(recording)
         bases = _bases(matches)
         for each in matches:
             recording.set_time(TIMELINE, timestamp=np.datetime64(each.match.t_ns, "ns"))
             _draw(recording, each, bases)
         recording.flush(timeout_sec=WRITING_S)
         recording.disconnect()
+
+
+def _series(recording: rr.RecordingStream) -> None:
+    """Points, for a recording of one frame has no lines."""
+    for name in (*SERIES, "landmarks"):
+        for number, colour in enumerate(SERIES_COLOURS):
+            entity, label = (number, f"level {number}") if name == "landmarks" else (AXES[number], AXES[number])
+            points = rr.SeriesPoints(colors=colour, names=label, marker_sizes=3.0)
+            recording.log(f"{name}/{entity}", points, static=True)
 
 
 def _bases(matches: Sequence[Pictured]) -> list[Basis]:
@@ -154,10 +162,12 @@ def _from_above(colours: NDArray[np.uint8]) -> Any:
 
 
 def _over_cells(pictured: Pictured, offset: Floats, cells: int) -> Any:
-    """The map in pixels of such an image of so many cells."""
+    """The map in pixels of such an image of so many cells, dashed: of each piece only the middle is drawn, for it
+    would cover what it is compared with."""
     ends = ends_at(pictured.match.pieces, offset)[:, :, 1::-1]
+    ends = ends.mean(axis=1, keepdims=True) + DASH * (ends - ends.mean(axis=1, keepdims=True))
     pixels = cells / 2.0 * (1.0 - ends / pictured.bev.half_m)
-    return rr.LineStrips2D(pixels, colors=[(255, 255, 255, 110)], radii=rr.Radius.ui_points(0.5))
+    return rr.LineStrips2D(pixels, colors=[(255, 255, 255)], radii=rr.Radius.ui_points(0.5))
 
 
 def _histogram(recording: rr.RecordingStream, pictured: Pictured, level: int, found: Histogram) -> None:
@@ -180,7 +190,10 @@ def _histogram(recording: rr.RecordingStream, pictured: Pictured, level: int, fo
         place = _pixels(found, pose[None, :2])
         mark = rr.Points2D(place, colors=[colour], radii=rr.Radius.ui_points(4.0), labels=[name], show_labels=False)
         recording.log(f"{entity}/poses/{name.replace(' ', '_')}", mark)
-    recording.log(f"{entity}/yaw", rr.BarChart(found.yaw_mass, abscissa=np.degrees(found.yaw), color=(150, 85, 170)))
+    yaw = np.degrees(found.yaw)
+    widths = np.full(len(yaw), yaw[1] - yaw[0])
+    bars = rr.BarChart(found.yaw_mass, abscissa=yaw, widths=widths, color=(150, 85, 170))
+    recording.log(f"{entity}/yaw", bars)
 
 
 def _pixels(found: Histogram, xy: Floats) -> Floats:
@@ -218,9 +231,6 @@ def _figures(recording: rr.RecordingStream, pictured: Pictured) -> None:
         recording.log(f"landmarks/{level}", rr.Scalars(count))
     if not match.found:
         return
-    rows = {"offset": estimated_offset(match), "sigma": sigmas(match)}
-    if pictured.truth is not None:
-        rows["error"] = error_of(match, pictured.truth)
-    for name, row in rows.items():
-        for axis, value in zip(AXES, row * UNITS, strict=True):
+    for name, row in along_time(pictured).items():
+        for axis, value in zip(AXES, row, strict=True):
             recording.log(f"{name}/{axis}", rr.Scalars(value))
