@@ -80,7 +80,9 @@ def _histograms(levels: range) -> Any:
         entity = f"/histogram/{level}"
         contents = [f"{entity}/mass", f"{entity}/ellipse", f"{entity}/poses/**"]
         mass = rrb.Spatial2DView(origin=entity, contents=contents, name=f"Histogram {level}", background=BACKGROUND)
-        yaw = rrb.BarChartView(origin=f"{entity}/yaw", name=f"yaw {level}, deg")
+        yaw = rrb.BarChartView(
+            origin=f"{entity}/yaw", name=f"yaw {level}, deg", plot_legend=rrb.PlotLegend(visible=False)
+        )
         rows.append(rrb.Horizontal(mass, yaw, column_shares=[1.4, 1.0]))
     return rrb.Vertical(*rows)
 

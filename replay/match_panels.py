@@ -102,7 +102,7 @@ def map_panel(figure: Any, place: Any, pictured: Pictured, offset: Floats, title
     """Pieces of map at an offset over the points near the vehicle, paint bright."""
     match = pictured.match
     half = min(CLOSE_M, _half_m(pictured))
-    axes = _from_above(figure, place, half, title if match.found or not offset.any() else f"{title}: none")
+    axes = _from_above(figure, place, half, title)
     _backdrop(axes, pictured, half)
     ends = ends_at(match.pieces, offset)
     for kind, colour in COLOURS.items():

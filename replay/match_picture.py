@@ -32,6 +32,8 @@ from sensors.whole_file import whole_file
 
 Floats = NDArray[np.float64]
 
+Panel = Callable[[Any, Any], None]
+"""Draws itself into a figure at a place of its grid."""
 PANEL_IN = 3.9
 """Side of a panel, inches."""
 IMAGES_BY_ROW = 4
@@ -43,7 +45,14 @@ HEAD_IN, FOOT_IN = 0.75, 0.75
 
 
 def draw_match(pictured: Pictured, path: Path) -> None:
-    """Write a PNG, whole or not at all.
+    """Write a PNG, whole or not at all."""
+    figure = figure_of(pictured)
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=DPI, format="png", metadata={"Software": None})
+
+
+def figure_of(pictured: Pictured) -> Any:
+    """A match as a figure.
 
     Columns: points and map before and after; by level the features, the semantic maps where the matcher was asked for
     them, what each piece adds to the score, and the histogram. Below them the images of the frame, where it has any.
@@ -65,22 +74,18 @@ def draw_match(pictured: Pictured, path: Path) -> None:
     if pairs:
         _images(parts[1], pictured, pairs)
     _words(figure, pictured, width, whole)
-    with whole_file(path) as partial:
-        figure.savefig(partial, dpi=DPI, format="png", metadata={"Software": None})
-
-
-Panel = Callable[[Any, Any], None]
+    return figure
 
 
 def _columns(pictured: Pictured) -> list[list[Panel]]:
-    """What stands where: each draws itself into a figure at a place of its grid."""
+    """What stands where, from above."""
     match = pictured.match
-    after = estimated_offset(match)
+    after, late = estimated_offset(match), "Map at the estimated pose" + ("" if match.found else ": none")
     columns: list[list[Panel]] = [
         [
             lambda figure, place: points_panel(figure, place, pictured),
             lambda figure, place: map_panel(figure, place, pictured, np.zeros(3), "Map at the initial pose"),
-            lambda figure, place: map_panel(figure, place, pictured, after, "Map at the estimated pose"),
+            lambda figure, place: map_panel(figure, place, pictured, after, late),
         ]
     ]
     if match.output is None:
