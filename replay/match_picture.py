@@ -62,18 +62,21 @@ def figure_of(pictured: Pictured) -> Any:
     rows = max(len(column) for column in columns)
     width, height = (PANEL_IN + 0.5) * len(columns), (PANEL_IN + 0.5) * rows
     below = len(pairs) * _image_in(pictured, width / len(pairs[0])) if pairs else 0.0
-    whole = height + below + HEAD_IN + FOOT_IN
-    figure = Figure(figsize=(width, whole), layout="constrained")
+    heights = [HEAD_IN, height, *([below] if pairs else []), FOOT_IN]
+    figure = Figure(figsize=(width, sum(heights)), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.get_layout_engine().set(hspace=0.05, rect=(0.0, FOOT_IN / whole, 1.0, 1.0 - (HEAD_IN + FOOT_IN) / whole))
-    parts = figure.subfigures(2, 1, height_ratios=[height, below]) if pairs else [figure]
-    grid = parts[0].add_gridspec(rows, len(columns))
+    figure.get_layout_engine().set(hspace=0.025, wspace=0.01)
+    head, body, *middle, foot = figure.subfigures(len(heights), 1, height_ratios=heights)
+    grid = body.add_gridspec(rows, len(columns))
     for number, column in enumerate(columns):
         for row, panel in enumerate(column):
-            panel(parts[0], grid[row, number])
-    if pairs:
-        _images(parts[1], pictured, pairs)
-    _words(figure, pictured, width, whole)
+            panel(body, grid[row, number])
+    for each in middle:
+        _images(each, pictured, pairs)
+    first, second = title(pictured)
+    head.text(0.008, 0.8, first, fontsize=13, weight="bold", va="top")
+    head.text(0.008, 0.4, second, fontsize=11.5, va="top")
+    _legend(foot, pictured, width)
     return figure
 
 
@@ -133,11 +136,8 @@ def _images(figure: Any, pictured: Pictured, pairs: list[list[tuple[Image, bool]
             image_panel(axes, pictured, image, offset, words)
 
 
-def _words(figure: Any, pictured: Pictured, width_in: float, height_in: float) -> None:
-    """The title, and the legend of everything."""
-    first, second = title(pictured)
-    figure.text(0.008, 1.0 - 0.12 / height_in, first, fontsize=13, weight="bold", va="top")
-    figure.text(0.008, 1.0 - 0.42 / height_in, second, fontsize=11.5, va="top")
+def _legend(figure: Any, pictured: Pictured, width_in: float) -> None:
+    """Of everything that is drawn."""
     kinds = [kind for kind in COLOURS if (pictured.match.pieces.type == kind).any()]
     handles = [Line2D([], [], color=COLOURS[kind], lw=4, label=kind_name(kind)) for kind in kinds]
     if histograms(pictured.match):
@@ -146,6 +146,6 @@ def _words(figure: Any, pictured: Pictured, width_in: float, height_in: float) -
     if not handles:
         return
     across = min(len(handles), max(int(width_in / LEGEND_IN), 1))
-    legend = figure.legend(handles=handles, loc="lower left", ncols=across, fontsize=11, facecolor="#30363d")
+    legend = figure.legend(handles=handles, loc="center left", ncols=across, fontsize=11, facecolor="#30363d")
     for text in legend.get_texts():
         text.set_color("white")

@@ -141,7 +141,6 @@ def test_pieces_appear_in_an_image_where_they_stand() -> None:
     np.testing.assert_allclose(pole[:, 0], expected[0, 0], atol=1e-3)  # upright in a level camera
     parts = (pole[:, 1] - expected[0, 1]) / (expected[1, 1] - expected[0, 1]) * 16
     np.testing.assert_allclose(parts, np.rint(parts), atol=1e-3)
-    assert set(match.pieces.type[strokes.piece].tolist()) >= {Kind.LANE_LINE, Kind.POLE}
     assert (match.pieces.ends[strokes.piece][:, :, 0].max(axis=1) > 1.0).all()  # the camera looks on from 1.5 m ahead
 
 

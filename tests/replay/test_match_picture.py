@@ -31,8 +31,17 @@ def starting(found: dict[str, Any], *beginnings: str) -> list[Any]:
     return [axes for name, axes in found.items() for beginning in beginnings if name.startswith(beginning)]
 
 
-def test_the_panels_of_a_whole_match() -> None:
-    found = panels(pictured(seen=frame(images=(camera(),))))
+@pytest.fixture(scope="module")
+def whole() -> Pictured:
+    return pictured(seen=frame(images=(camera(),)))
+
+
+@pytest.fixture(scope="module")
+def found(whole: Pictured) -> dict[str, Any]:
+    return panels(whole)
+
+
+def test_the_panels_of_a_whole_match(found: dict[str, Any]) -> None:
     sorts = ("Features", "Semantic map", "Share of the score", "Histogram")
     assert [len(starting(found, sort)) for sort in sorts] == [3, 3, 3, 3]
     assert {"Map at the initial pose", "Map at the estimated pose"} <= set(found)
@@ -45,11 +54,9 @@ def test_the_panels_of_a_whole_match() -> None:
         assert axes.get_xlim() == (left, right)  # left is left
 
 
-def test_segments_are_drawn_where_they_lie() -> None:
-    seen = pictured()
-    found = panels(seen)
-    for title, offset in (("initial", np.zeros(3)), ("estimated", estimated_offset(seen.match))):
-        check_pieces(found[f"Map at the {title} pose"], seen, offset)
+def test_segments_are_drawn_where_they_lie(whole: Pictured, found: dict[str, Any]) -> None:
+    for title, offset in (("initial", np.zeros(3)), ("estimated", estimated_offset(whole.match))):
+        check_pieces(found[f"Map at the {title} pose"], whole, offset)
 
 
 def check_pieces(axes: Any, seen: Pictured, offset: NDArray[np.float64]) -> None:
@@ -66,9 +73,8 @@ def check_pieces(axes: Any, seen: Pictured, offset: NDArray[np.float64]) -> None
         assert any(len(mark) == len(expected) and np.allclose(mark, expected) for mark in marks)
 
 
-def test_a_histogram_is_drawn_to_scale() -> None:
-    seen = pictured()
-    (axes,) = starting(panels(seen), "Histogram 2")
+def test_a_histogram_is_drawn_to_scale(whole: Pictured, found: dict[str, Any]) -> None:
+    (axes,) = starting(found, "Histogram 2")
     (shown,) = axes.get_images()
     left_begin, left_end, begin, end = shown.get_extent()
     mass = shown.get_array()
@@ -77,7 +83,7 @@ def test_a_histogram_is_drawn_to_scale() -> None:
     forward = begin + step * (np.arange(len(mass)) + 0.5)
     left = left_begin + step * (np.arange(len(mass)) + 0.5)
     assert left_end == pytest.approx(left[-1] + step / 2)
-    offset = estimated_offset(seen.match)
+    offset = estimated_offset(whole.match)
     assert (mass.sum(axis=1) @ forward, mass.sum(axis=0) @ left) == pytest.approx(tuple(offset[:2]), abs=1e-5)
 
 
@@ -94,8 +100,8 @@ def test_what_there_is_not_is_left_out(tmp_path: Path) -> None:
     assert len(starting(panels(seeing), "no points", "Histogram", "Features")) == 7
 
 
-def test_a_picture_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    draw_match(pictured(seen=frame(images=(camera(),))), tmp_path / "m.png")
+def test_a_picture_is_written_whole_or_not_at_all(whole: Pictured, tmp_path: Path) -> None:
+    draw_match(whole, tmp_path / "m.png")
     with Pillow.open(tmp_path / "m.png") as drawn:
         assert drawn.width > 2000
         seen = {tuple(colour) for colour in np.asarray(drawn.convert("RGB")).reshape(-1, 3)[::3].tolist()}
