@@ -1,13 +1,19 @@
 """Covariances of a network's histograms, brought to the size of its errors: R = D Sigma D + diag(b step^2 / 12).
 
-Level by level: Sigma is the histogram's covariance, D = diag(sqrt(a)) widens or narrows it along each axis and leaves
-correlations as they are, b counts what a candidate's own cell adds (step^2 / 12 is the variance of a uniform error one
-step wide). The mean is not touched, as a temperature on the scores would. ``calibration_fit`` finds a and b on worlds
-of their own; they lie beside the weights, in NAME-calibration.toml, and hold for those alone.
+Level by level: Sigma is the histogram's covariance. D is diagonal, D_ii^2 = a_i v_i^(power_i - 1) with the variance
+v_i = Sigma_ii / step_i^2: each axis' variance becomes a v^power, and correlations stay. b counts what a candidate's own
+cell adds (step^2 / 12 is the variance of a uniform error one step wide). The mean is not touched, as a temperature on
+the scores would.
+
+Why a power: trained to spread its target over the candidates around the truth, a network that is sure is off by far
+less than its histogram is wide, one that is not sure by about as much. A factor alone (power 1) is too large for the
+one or too small for the other.
+
+``calibration_fit`` finds a, b and power on worlds of their own; they lie beside the weights, in NAME-calibration.toml,
+and hold for those alone.
 """
 
 import hashlib
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -24,12 +30,14 @@ from sensors.whole_file import whole_file
 Floats = NDArray[np.float64]
 
 _HEAD = """\
-# Of the covariances beside it: R = D Sigma D + diag(b step^2 / 12), D = diag(sqrt(a)), rows by level, columns lon, lat,
-# yaw. Written by egoloc eval --calibrate; nll: mean, in nats, of used frames, before and after.
+# Covariances of the weights beside it: R = D Sigma D + diag(b step^2 / 12), D = diag(sqrt(a v^(power - 1))) with the
+# variances v of Sigma in step^2. Rows: levels, coarse to fine; columns: longitudinal, lateral, yaw.
+# Written by egoloc eval --calibrate. nll: mean negative log likelihood of the used frames' errors, nats.
 
 """
 _A = Annotated[float, msgspec.Meta(gt=0.0, lt=1e12)]
 _B = Annotated[float, msgspec.Meta(ge=0.0, lt=1e12)]
+_Power = Annotated[float, msgspec.Meta(ge=1.0, le=4.0)]
 
 
 class Fit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,6 +47,8 @@ class Fit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Of the calibration's worlds."""
     noise: tuple[str, ...]
     """Presets of the initial poses, which take turns."""
+    maps: tuple[str, ...]
+    """What there was of the maps, in turns as well."""
     seed: int
     """Of that noise."""
     used: tuple[int, ...]
@@ -52,32 +62,42 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights_sha256: str
     a: tuple[tuple[_A, _A, _A], ...]
     b: tuple[tuple[_B, _B, _B], ...]
+    power: tuple[tuple[_Power, _Power, _Power], ...]
     fit: Fit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """a: (L, 3) factors of the variances; b: (L, 3) of step^2 / 12; step: (L, 3) of the lattice, m, m, rad; fit: None
-    where the network has no calibration: covariances then stay as they are."""
+    """a: (L, 3) factors of the variances; b: (L, 3) of step^2 / 12; power: (L, 3) of the variances; step: (L, 3) of the
+    lattice, m, m, rad; fit: None where the network has no calibration: covariances then stay as they are."""
 
     a: Floats
     b: Floats
+    power: Floats
     step: Floats
     fit: Fit | None = None
 
     def calibrated(self, cov: ArrayLike, level: int) -> Floats:
         """Covariances (..., 3, 3) of a level in (m, m, rad), body axes at its centre. Infinite ones stay infinite."""
-        return _widened(cov, self.a[level], self.b[level], self.step[level])
+        rows = slice(level, level + 1)
+        one = Calibration(self.a[rows], self.b[rows], self.power[rows], self.step[rows])
+        found: Floats = one.of_levels(np.asarray(cov)[..., None, :, :])[..., 0, :, :]
+        return found
 
     def of_levels(self, cov: ArrayLike) -> Floats:
         """The same of all levels (..., L, 3, 3)."""
-        return _widened(cov, self.a, self.b, self.step)
+        given = np.asarray(cov, np.float64)
+        variance = np.diagonal(given, axis1=-2, axis2=-1) / self.step**2
+        finite = np.where(np.isfinite(variance), variance, 1.0)
+        scale = np.sqrt(self.a * finite ** (self.power - 1.0))
+        scaled: Floats = given * scale[..., :, None] * scale[..., None, :]
+        return scaled + (self.b * self.step**2 / 12.0)[..., None] * np.eye(3)
 
 
 def uncalibrated(lattice: LatticeConfig) -> Calibration:
     """Leaves covariances as they are."""
     step = steps_of(lattice)
-    return Calibration(np.ones_like(step), np.zeros_like(step), step)
+    return Calibration(np.ones_like(step), np.zeros_like(step), np.ones_like(step), step)
 
 
 def steps_of(lattice: LatticeConfig) -> Floats:
@@ -100,14 +120,15 @@ def read_calibration(weights: Path, lattice: LatticeConfig) -> Calibration:
     if not path.is_file():
         return uncalibrated(lattice)
     given = read_toml(path, _File, "a calibration")
-    for name, rows in (("a", given.a), ("b", given.b)):
+    for name, rows in (("a", given.a), ("b", given.b), ("power", given.power)):
         if len(rows) != lattice.levels:
             raise EgolocError(f"{path}: {name}: expected {lattice.levels} rows, the network's levels, got {len(rows)}")
     if given.weights_sha256 != _sha256(weights):
         raise EgolocError(
-            f"{path}: weights_sha256: expected those of {weights.name}, got other ones: egoloc eval --calibrate fits anew"
+            f"{path}: weights_sha256: expected that of {weights.name}, got another's: egoloc eval --calibrate fits anew"
         )
-    return Calibration(np.array(given.a), np.array(given.b), steps_of(lattice), given.fit)
+    a, b, power = (np.array(rows) for rows in (given.a, given.b, given.power))
+    return Calibration(a, b, power, steps_of(lattice), given.fit)
 
 
 def write_calibration(calibration: Calibration, weights: Path) -> Path:
@@ -115,18 +136,20 @@ def write_calibration(calibration: Calibration, weights: Path) -> Path:
     if calibration.fit is None:
         raise EgolocError(f"{weights}: expected a calibration that was fitted")
     path = calibration_path(weights)
-    rows = [tuple(map(tuple, values.tolist())) for values in (calibration.a, calibration.b)]
-    text = _HEAD + config_toml(_File(_sha256(weights), *rows, calibration.fit))
+    held = _File(
+        weights_sha256=_sha256(weights),
+        a=_rows(calibration.a),
+        b=_rows(calibration.b),
+        power=_rows(calibration.power),
+        fit=calibration.fit,
+    )
     with whole_file(path) as part:
-        part.write_text(text)
+        part.write_text(_HEAD + config_toml(held))
     return path
 
 
-def _widened(cov: ArrayLike, a: Floats, b: Floats, step: Floats) -> Floats:
-    """(..., 3, 3); a, b, step: (..., 3)."""
-    scale = np.sqrt(a)
-    scaled: Floats = np.asarray(cov, np.float64) * scale[..., :, None] * scale[..., None, :]
-    return scaled + (b * step**2 / 12.0)[..., None] * np.eye(3)
+def _rows(values: Floats) -> tuple[tuple[float, float, float], ...]:
+    return tuple((lon, lat, yaw) for lon, lat, yaw in values.tolist())
 
 
 def _sha256(weights: Path) -> str:

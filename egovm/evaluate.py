@@ -23,6 +23,7 @@ from egovm.dataset import NOISES, EvaluationBatches, loader
 from egovm.honesty import AXES, honesty
 from egovm.judging import Judged, LevelErrors, joined, judged, level_errors
 from egovm.lattice import between
+from egovm.map_contents import MapContent
 from egovm.network import EgoVM
 from egovm.pose_solver import PoseEstimate
 from sensors.errors import EgolocError
@@ -35,6 +36,9 @@ BELOW = {"lon": (0.1, 0.2, 0.3), "lat": (0.1, 0.2, 0.3), "yaw": (0.1, 0.3, 0.6)}
 """Errors are counted under these, m and deg."""
 CALIBRATION_NOISE = ("uniform", "gauss")
 """Presets that take turns in a calibration: where a user's initial poses lie, nobody knows."""
+CALIBRATION_MAPS: tuple[MapContent, ...] = ("full", "no-surfels", "full", "lines", "thinned")
+"""And these maps. On full ones alone errors hardly follow the histograms' widths; a fit to them makes all covariances
+small, also where a poor map leaves the pose open and the width is true."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,8 @@ class Errors:
 
 @dataclass(frozen=True)
 class InTurns(Dataset[tuple[Batch, Truth]]):
-    """One of as many frames, each number from the next of several batches."""
+    """Each frame from the next of several batches, one frame later in each next round of the worlds: all of them meet
+    every world."""
 
     several: tuple[EvaluationBatches, ...]
 
@@ -59,7 +64,8 @@ class InTurns(Dataset[tuple[Batch, Truth]]):
         return len(self.several[0])
 
     def __getitem__(self, number: int) -> tuple[Batch, Truth]:
-        return self.several[number % len(self.several)][number]
+        turn = number + number // self.several[0].recipe.worlds
+        return self.several[turn % len(self.several)][number]
 
 
 def evaluate(
@@ -70,15 +76,21 @@ def evaluate(
 
 
 def calibrate(network: EgoVM, batches: EvaluationBatches, workers: int = 1, tell: Tell = id) -> Calibration:
-    """A calibration from the frames of the batches, with CALIBRATION_NOISE for theirs.
+    """A calibration from the frames of the batches, with CALIBRATION_NOISE and CALIBRATION_MAPS for theirs.
 
     Raises EgolocError for a network that regresses the pose, and where frames are too few.
     """
-    turns = InTurns(tuple(replace(batches, noise=NOISES[name]) for name in CALIBRATION_NOISE))
+    turns = InTurns(
+        tuple(
+            replace(batches, noise=NOISES[name], content=content)
+            for name in CALIBRATION_NOISE
+            for content in CALIBRATION_MAPS
+        )
+    )
     levels = errors_of(network, turns, workers, tell).levels
     if levels is None:
         raise EgolocError("calibration: expected a network with a histogram, for regression states no covariance")
-    return fitted(levels, network.config.solver.lattice, CALIBRATION_NOISE, batches.seed)
+    return fitted(levels, network.config.solver.lattice, CALIBRATION_NOISE, CALIBRATION_MAPS, batches.seed)
 
 
 @torch.inference_mode()
