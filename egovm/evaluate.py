@@ -64,8 +64,11 @@ class InTurns(Dataset[tuple[Batch, Truth]]):
         return len(self.several[0])
 
     def __getitem__(self, number: int) -> tuple[Batch, Truth]:
-        turn = number + number // self.several[0].recipe.worlds
-        return self.several[turn % len(self.several)][number]
+        return self.several[self.turn(number)][number]
+
+    def turn(self, number: int) -> int:
+        """Which of the batches a frame comes from."""
+        return sum(divmod(number, self.several[0].recipe.worlds)) % len(self.several)
 
 
 def evaluate(

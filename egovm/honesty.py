@@ -34,8 +34,8 @@ def nees(error: Floats, cov: Floats) -> tuple[Floats, Floats]:
     NaN where a covariance is infinite, for it states nothing; infinite where it has no width.
     """
     variance = np.diagonal(cov, axis1=1, axis2=2)
-    known: Mask = np.isfinite(cov.reshape(-1, 9)).all(axis=1)
-    wide: Mask = known & (variance > 0.0).all(axis=1)
+    known: Mask = np.isfinite(np.abs(cov).max(axis=(1, 2)))
+    wide: Mask = known & (variance.min(axis=1) > 0.0)
     sigma = np.sqrt(np.where(wide[:, None], variance, 1.0))
     alike = np.where(wide[:, None, None], cov, np.eye(3)) / (sigma[:, :, None] * sigma[:, None])
     values, axes = np.linalg.eigh(alike)

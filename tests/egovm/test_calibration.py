@@ -55,18 +55,21 @@ def found() -> Calibration:
 
 
 def test_a_scale_that_is_known_is_found(found: Calibration) -> None:
-    np.testing.assert_allclose(found.a, A, rtol=0.15)
-    np.testing.assert_allclose(found.power, POWER, atol=0.12)
-    for level in range(3):  # b where it is not drowned: a cell's share of the variance of the sharpest histograms
-        assert abs(np.log(found.b[level] / B[level])).max() < 0.6
+    """Sigmas within a tenth of the true ones over all widths; what a, b and power have of them, less surely."""
+    cov = histograms(500, 13)
+    sigma, true = (np.sqrt(np.diagonal(each, axis1=2, axis2=3)) for each in (found.of_levels(cov), TRUE.of_levels(cov)))
+    np.testing.assert_allclose(sigma, true, rtol=0.1)
+    np.testing.assert_allclose(found.a, A, rtol=0.3)
+    np.testing.assert_allclose(found.power, POWER, atol=0.2)
+    assert abs(np.log(found.b / B)).max() < 0.7
     assert found.fit is not None
     assert found.fit.used == (1500, 1500, 1500)
-    assert (found.fit.frames, found.fit.seed, found.fit.noise, found.fit.maps) == (3000, 7, ("uniform",), ("full",))
+    assert (found.fit.frames, found.fit.seed, found.fit.noise, found.fit.maps) == (1500, 7, ("uniform",), ("full",))
     assert all(after < before for before, after in zip(found.fit.nll_before, found.fit.nll_after, strict=True))
 
 
 def test_others_drawn_alike_are_then_honest(found: Calibration) -> None:
-    """NEES of other errors, within four standard deviations of the chi-square's mean and of what the fit leaves."""
+    """NEES of other errors, within four standard deviations of chi-square's mean and median, and what the fit adds."""
     cov = histograms(1000, 2)
     errors = off_by(cov, TRUE.of_levels(cov), 3)
     for level in range(3):
@@ -75,7 +78,7 @@ def test_others_drawn_alike_are_then_honest(found: Calibration) -> None:
         assert raw is not None
         assert told is not None
         assert told["mean_by_3"] == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 3.0 / 1000) + 0.02)
-        assert told["median_by_3"] == pytest.approx(0.79, abs=0.09)
+        assert told["median_by_3"] == pytest.approx(0.79, abs=4.0 * 0.028 + 0.02)
         assert abs(math.log(told["mean_by_3"])) < abs(math.log(raw["mean_by_3"]))
         assert told["nll"] < raw["nll"]
 
