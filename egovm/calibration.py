@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from egovm.config import LatticeConfig
 from egovm.config_file import config_toml, read_toml
 from sensors.errors import EgolocError
+from sensors.histogram import stated_covariance
 from sensors.whole_file import whole_file
 
 Floats = NDArray[np.float64]
@@ -68,36 +69,58 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """a: (L, 3) factors of the variances; b: (L, 3) of step^2 / 12; power: (L, 3) of the variances; step: (L, 3) of the
-    lattice, m, m, rad; fit: None where the network has no calibration: covariances then stay as they are."""
+    """a: (L, 3) factors of the variances; b: (L, 3) of step^2 / 12; power: (L, 3) of the variances; fit: None where
+    the network has no calibration: covariances then stay as they are."""
 
     a: Floats
     b: Floats
     power: Floats
-    step: Floats
+    lattice: LatticeConfig
     fit: Fit | None = None
 
     def calibrated(self, cov: ArrayLike, level: int) -> Floats:
         """Covariances (..., 3, 3) of a level in (m, m, rad), body axes at its centre. Infinite ones stay infinite."""
-        rows = slice(level, level + 1)
-        one = Calibration(self.a[rows], self.b[rows], self.power[rows], self.step[rows])
-        found: Floats = one.of_levels(np.asarray(cov)[..., None, :, :])[..., 0, :, :]
-        return found
+        return self._widened(np.asarray(cov, np.float64), level)
 
     def of_levels(self, cov: ArrayLike) -> Floats:
         """The same of all levels (..., L, 3, 3)."""
-        given = np.asarray(cov, np.float64)
-        variance = np.diagonal(given, axis1=-2, axis2=-1) / self.step**2
+        return self._widened(np.asarray(cov, np.float64), slice(None))
+
+    def _widened(self, cov: Floats, rows: int | slice) -> Floats:
+        step = steps_of(self.lattice)[rows]
+        variance = np.diagonal(cov, axis1=-2, axis2=-1) / step**2
         finite = np.where(np.isfinite(variance), variance, 1.0)
-        scale = np.sqrt(self.a * finite ** (self.power - 1.0))
-        scaled: Floats = given * scale[..., :, None] * scale[..., None, :]
-        return scaled + (self.b * self.step**2 / 12.0)[..., None] * np.eye(3)
+        scale = np.sqrt(self.a[rows] * finite ** (self.power[rows] - 1.0))
+        scaled: Floats = cov * scale[..., :, None] * scale[..., None, :]
+        return scaled + (self.b[rows] * step**2 / 12.0)[..., None] * np.eye(3)
+
+
+def stated(calibration: Calibration, cov: ArrayLike, yaw: ArrayLike) -> Floats:
+    """(N, 3, 3) what a fix states: the last level's covariance calibrated, and along directions in which a level was
+    flat that level's as it is (``sensors.histogram``), in body axes at the last level's centre.
+
+    cov: (N, L, 3, 3) of the histograms; yaw: (N, L) of the levels' centres, rad. Infinite where the last level's is.
+    """
+    raw, yaws = np.asarray(cov, np.float64), np.asarray(yaw, np.float64)
+    known = np.isfinite(np.abs(raw).max(axis=(1, 2, 3)))
+    angle = (yaws - yaws[:, -1:])[known]
+    R = np.zeros((*angle.shape, 3, 3))
+    R[..., 0, 0] = R[..., 1, 1] = np.cos(angle)
+    R[..., 1, 0] = np.sin(angle)
+    R[..., 0, 1] = -R[..., 1, 0]
+    R[..., 2, 2] = 1.0
+    turned = R @ raw[known] @ R.swapaxes(-1, -2)
+    lattice = calibration.lattice
+    flat = steps_of(lattice) * np.sqrt((lattice.steps**2 - 1) / 12.0)
+    found = calibration.calibrated(raw[:, -1], -1)
+    found[known] += stated_covariance(turned, flat) - turned[:, -1]
+    return found
 
 
 def uncalibrated(lattice: LatticeConfig) -> Calibration:
     """Leaves covariances as they are."""
-    step = steps_of(lattice)
-    return Calibration(np.ones_like(step), np.zeros_like(step), np.ones_like(step), step)
+    ones = np.ones((lattice.levels, 3))
+    return Calibration(ones, np.zeros_like(ones), ones, lattice)
 
 
 def steps_of(lattice: LatticeConfig) -> Floats:
@@ -128,7 +151,7 @@ def read_calibration(weights: Path, lattice: LatticeConfig) -> Calibration:
             f"{path}: weights_sha256: expected that of {weights.name}, got another's: egoloc eval --calibrate fits anew"
         )
     a, b, power = (np.array(rows) for rows in (given.a, given.b, given.power))
-    return Calibration(a, b, power, steps_of(lattice), given.fit)
+    return Calibration(a, b, power, lattice, given.fit)
 
 
 def write_calibration(calibration: Calibration, weights: Path) -> Path:

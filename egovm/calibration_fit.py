@@ -47,7 +47,7 @@ def fitted(
         after.append(_nll(best, error, cov)[0])
     nll = (tuple(_rounded(np.array(values)).tolist()) for values in (before, after))
     fit = Fit(len(errors.error), tuple(noise), tuple(maps), seed, tuple(used), *nll)
-    return Calibration(found[:, :3], found[:, 3:6], found[:, 6:], step, fit)
+    return Calibration(found[:, :3], found[:, 3:6], found[:, 6:], lattice, fit)
 
 
 def _used(errors: LevelErrors, level: int, step: Floats) -> tuple[Floats, Floats]:

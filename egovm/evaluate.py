@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from egovm.batch import Batch, Truth
-from egovm.calibration import Calibration
+from egovm.calibration import Calibration, stated, steps_of
 from egovm.calibration_fit import fitted
 from egovm.convolutions import deployed
 from egovm.dataset import NOISES, EvaluationBatches, loader
@@ -122,6 +122,7 @@ def summary(errors: Errors, calibration: Calibration) -> Report:
         "without_landmarks": int((~errors.found).sum()),
         "methods": {"initial": _method(errors.initial), "egovm": _method(errors.estimate)},
         "covariance": None if errors.levels is None else _levels(errors.levels, calibration),
+        "stated": None if errors.levels is None else _stated(errors.levels, calibration),
         "network_ms": {"p50": 1e3 * float(np.median(errors.seconds)), "max": 1e3 * float(errors.seconds.max())},
     }
 
@@ -150,7 +151,7 @@ def _levels(levels: LevelErrors, calibration: Calibration) -> list[Report]:
     """By level, coarse to fine: honesty of its covariances, raw and calibrated, over all frames that state one."""
     fitted_covs = calibration.of_levels(levels.cov)
     found = []
-    for level, (step_m, _, step_rad) in enumerate(calibration.step.tolist()):
+    for level, (step_m, _, step_rad) in enumerate(steps_of(calibration.lattice).tolist()):
         error = levels.error[:, level]
         found.append(
             {
@@ -162,6 +163,11 @@ def _levels(levels: LevelErrors, calibration: Calibration) -> list[Report]:
             }
         )
     return found
+
+
+def _stated(levels: LevelErrors, calibration: Calibration) -> Report | None:
+    """Honesty of what a fix states."""
+    return honesty(levels.error[:, -1], stated(calibration, levels.cov, levels.yaw))
 
 
 def _joined(initial: Tensor, found: list[Judged], levels: LevelErrors | None, seconds: Floats) -> Errors:

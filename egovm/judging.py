@@ -29,12 +29,14 @@ class LevelErrors:
     """What the L levels of N frames are off, in (m, m, rad) along body axes at each level's centre.
 
     error: (N, L, 3) truth minus the estimate composed up to the level; cov: (N, L, 3, 3) as the level's histogram has
-    it, infinite on its diagonal without landmarks; inside: (N, L) bool, the truth lies within the level's window.
+    it, infinite on its diagonal without landmarks; inside: (N, L) bool, the truth lies within the level's window; yaw:
+    (N, L) of the centres in the initial pose's axes, rad.
     """
 
     error: Floats
     cov: Floats
     inside: NDArray[np.bool_]
+    yaw: Floats
 
 
 @torch.no_grad()
@@ -47,16 +49,17 @@ def judged(estimate: PoseEstimate | RegressedPose, truth: Tensor) -> Judged:
 def level_errors(estimate: PoseEstimate, truth: Tensor, lattice: LatticeConfig) -> LevelErrors:
     """truth: (B, 3) T_init^-1 T_true. A truth beyond a window's outermost candidates is none that its mean can reach,
     and what the level is off says nothing of its covariance."""
-    errors, covs, inside = [], [], []
+    errors, covs, inside, yaws = [], [], [], []
     for number, level in enumerate(estimate.levels):
         there = between(level.centre.double(), truth.double())
         errors.append(there - level.mean.double())
         covs.append(level.cov.double())
         inside.append(in_window(lattice, number, there))
-    return LevelErrors(*(torch.stack(each, 1).cpu().numpy() for each in (errors, covs, inside)))
+        yaws.append(level.centre[:, 2].double())
+    return LevelErrors(*(torch.stack(each, 1).cpu().numpy() for each in (errors, covs, inside, yaws)))
 
 
 def joined(several: list[LevelErrors]) -> LevelErrors:
     """One after the other."""
-    names = ("error", "cov", "inside")
+    names = ("error", "cov", "inside", "yaw")
     return LevelErrors(*(np.concatenate([getattr(each, name) for each in several]) for name in names))

@@ -17,7 +17,7 @@ def evaluation_table(report: Mapping[str, Any]) -> Group:
     """Errors by axis and method, whether the covariances of the levels are honest, and what the figures are of."""
     parts: list[RenderableType] = [_errors(report["methods"]), ""]
     if report["covariance"] is not None:
-        parts += [_covariances(report["covariance"]), ""]
+        parts += [_covariances(report["covariance"], report["stated"]), ""]
     return Group(*parts, *map(Text, _notes(report)))
 
 
@@ -37,8 +37,8 @@ def _errors(methods: Mapping[str, Any]) -> Table:
     return table
 
 
-def _covariances(levels: Sequence[Mapping[str, Any]]) -> Table:
-    """A row for each level as its histogram has it, and one calibrated."""
+def _covariances(levels: Sequence[Mapping[str, Any]], stated: Mapping[str, Any] | None) -> Table:
+    """A row for each level as its histogram has it, and one calibrated; and what fixes state."""
     table = bare_table(2)
     for header in ("\ncovariance of", ""):
         table.add_column(header)
@@ -52,6 +52,8 @@ def _covariances(levels: Sequence[Mapping[str, Any]]) -> Table:
             if level[kind] is not None:
                 table.add_row(first, kind, *_honesty(level[kind]))
                 first = ""
+    if stated is not None:
+        table.add_row("a fix", "", *_honesty(stated))
     return table
 
 
@@ -73,7 +75,7 @@ def _notes(report: Mapping[str, Any]) -> Iterator[str]:
         return
     yield (
         f"Of true covariances: NEES/3 has mean 1 and median 0.79, an axis 1; 1 % lie beyond; ENCE is"
-        f" {last['ence_of_true']:.2f} on so many frames. The last level is the one that is stated."
+        f" {last['ence_of_true']:.2f} on so many frames. A fix states the last level and what an earlier one left open."
     )
     outside = [level["truth_outside"] for level in levels]
     if any(outside):

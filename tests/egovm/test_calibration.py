@@ -12,6 +12,7 @@ from egovm.calibration import (
     Calibration,
     calibration_path,
     read_calibration,
+    stated,
     steps_of,
     uncalibrated,
     write_calibration,
@@ -28,7 +29,7 @@ STEP = steps_of(LATTICE)
 A = np.array(((0.3, 2.0, 0.05), (1.0, 1.0, 1.0), (0.1, 9.0, 0.4)))
 B = np.array(((0.5, 1.0, 2.0), (1.0, 0.2, 1.0), (0.3, 3.0, 0.6)))
 POWER = np.array(((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), (2.0, 1.5, 1.0)))
-TRUE = Calibration(A, B, POWER, STEP)
+TRUE = Calibration(A, B, POWER, LATTICE)
 
 
 def histograms(count: int, seed: int) -> Floats:
@@ -45,7 +46,7 @@ def off_by(cov: Floats, true: Floats, seed: int) -> LevelErrors:
     rng = np.random.default_rng(seed)
     root = np.linalg.cholesky(true)
     error = np.einsum("nlij,nlj->nli", root, rng.normal(size=cov.shape[:3]))
-    return LevelErrors(error, cov, np.ones(cov.shape[:2], bool))
+    return LevelErrors(error, cov, np.ones(cov.shape[:2], bool), np.zeros(cov.shape[:2]))
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +110,7 @@ def test_frames_that_say_nothing_of_a_level_are_left_out(found: Calibration) -> 
         np.concatenate((errors.error, more, more)),
         np.concatenate((errors.cov, errors.cov[:5], unknown)),
         np.concatenate((errors.inside, more_inside, np.ones((5, 3), bool))),
+        np.zeros((1510, 3)),
     )
     again = fitted(spoiled, LATTICE)
     assert again.fit is not None
@@ -129,7 +131,7 @@ def test_too_few_frames_are_told() -> None:
 def test_histograms_without_width_get_one() -> None:
     """All weight at one candidate, as networks trained for points give: errors of a cell are all that there is."""
     errors = np.random.default_rng(10).uniform(-0.5, 0.5, (500, 3, 3)) * STEP
-    found = fitted(LevelErrors(errors, np.zeros((500, 3, 3, 3)), np.ones((500, 3), bool)), LATTICE)
+    found = fitted(LevelErrors(errors, np.zeros((500, 3, 3, 3)), np.ones((500, 3), bool), np.zeros((500, 3))), LATTICE)
     np.testing.assert_allclose(found.b, 1.0, rtol=0.15)
     cov = found.calibrated(np.zeros((3, 3)), 1)
     np.testing.assert_allclose(np.diagonal(cov), found.b[1] * STEP[1] ** 2 / 12.0)
@@ -155,6 +157,19 @@ def test_each_level_has_its_own() -> None:
     )
 
 
+def test_a_fix_states_the_last_level_and_what_an_earlier_one_left_open() -> None:
+    """The first level is flat along its x, which lies along the last one's y: its centre heads 90 deg to the right."""
+    cov = np.tile(np.eye(3) * 1e-2 * STEP[:, None] ** 2, (3, 1, 1, 1))
+    cov[1, 0, 0, 0] = open_m2 = (STEP[0, 0] ** 2) * (LATTICE.steps**2 - 1) / 12.0
+    cov[2] = np.diag(np.full(3, np.inf))
+    yaw = np.array(((0.0, 0.0, 0.0), (-np.pi / 2, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    found = stated(TRUE, cov, yaw)
+    last = TRUE.calibrated(cov[0, 2], 2)
+    np.testing.assert_allclose(found[0], last)
+    np.testing.assert_allclose(found[1], last + np.diag((0.0, open_m2, 0.0)), atol=1e-12)
+    assert np.isinf(np.diagonal(found[2])).all()
+
+
 def test_without_a_file_covariances_stay_as_they_are(tmp_path: Path) -> None:
     calibration = read_calibration(tmp_path / "a.safetensors", LATTICE)
     assert calibration.fit is None
@@ -171,7 +186,7 @@ def test_a_calibration_comes_back(tmp_path: Path, found: Calibration) -> None:
     assert path == calibration_path(weights) == tmp_path / "a-calibration.toml"
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a-calibration.toml", "a.safetensors"]
     read = read_calibration(weights, LATTICE)
-    for name in ("a", "b", "power", "step"):
+    for name in ("a", "b", "power"):
         assert np.array_equal(getattr(read, name), getattr(found, name))
     assert read.fit == found.fit
 

@@ -102,7 +102,9 @@ def off(error: list[list[float]]) -> LevelErrors:
     """One level, off by errors of N frames, beside covariances of 1 along each axis."""
     count = len(error)
     inside = np.arange(count)[:, None] != 3
-    return LevelErrors(np.array(error).reshape(count, 1, 3), np.tile(np.eye(3), (count, 1, 1, 1)), inside)
+    return LevelErrors(
+        np.array(error).reshape(count, 1, 3), np.tile(np.eye(3), (count, 1, 1, 1)), inside, np.zeros((count, 1))
+    )
 
 
 def test_figures_are_those_of_the_errors() -> None:
@@ -124,6 +126,7 @@ def test_figures_are_those_of_the_errors() -> None:
         assert level[kind]["median_by_3"] == pytest.approx(1.5 / factor)
         assert level[kind]["nees"]["yaw"] == pytest.approx(19.0 / 4.0 / factor)
         assert level[kind]["beyond_99"] == 0.25
+    assert report["stated"] == level["calibrated"]
 
 
 def test_frames_without_landmarks_are_counted_and_state_nothing() -> None:
