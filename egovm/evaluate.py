@@ -83,6 +83,8 @@ def calibrate(network: EgoVM, batches: EvaluationBatches, workers: int = 1, tell
 
     Raises EgolocError for a network that regresses the pose, and where frames are too few.
     """
+    if network.solver is None:
+        raise EgolocError("calibration: expected a network with a histogram: regression states no covariance")
     turns = InTurns(
         tuple(
             replace(batches, noise=NOISES[name], content=content)
@@ -91,8 +93,7 @@ def calibrate(network: EgoVM, batches: EvaluationBatches, workers: int = 1, tell
         )
     )
     levels = errors_of(network, turns, workers, tell).levels
-    if levels is None:
-        raise EgolocError("calibration: expected a network with a histogram, for regression states no covariance")
+    assert levels is not None
     return fitted(levels, network.config.solver.lattice, CALIBRATION_NOISE, CALIBRATION_MAPS, batches.seed)
 
 

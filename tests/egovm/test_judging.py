@@ -3,20 +3,24 @@
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from egovm.calibration import Fit, uncalibrated
-from egovm.config import LatticeConfig
-from egovm.evaluate import Errors, summary
+from egovm.config import ABLATIONS, LatticeConfig
+from egovm.dataset import NOISES, EvaluationBatches
+from egovm.evaluate import Errors, calibrate, summary
 from egovm.honesty import nees
 from egovm.judging import LevelErrors, judged, level_errors
 from egovm.lattice import between, compose
+from egovm.network import EgoVM
 from egovm.pose_solver import PoseEstimate, PoseSolver
 from egovm.regression_solver import RegressedPose
 from sensors.errors import EgolocError
+from tests.egovm.made_training import NETWORK, RECIPE
 
 LATTICE = LatticeConfig(half_m=1.0, half_deg=2.0, steps=5, levels=1)
 
@@ -152,3 +156,9 @@ def test_no_covariance_at_all_is_no_figure() -> None:
 def test_nothing_to_judge_is_told() -> None:
     with pytest.raises(EgolocError, match="expected one frame or more, got none"):
         summary(errors(0, estimate=np.empty((0, 3)), levels=None), CALIBRATED)
+
+
+def test_a_network_that_regresses_has_nothing_to_calibrate() -> None:
+    network = EgoVM(msgspec.structs.replace(NETWORK, ablation=ABLATIONS["A6"]))
+    with pytest.raises(EgolocError, match="regression states no covariance"):
+        calibrate(network, EvaluationBatches(RECIPE, network.config, NOISES["uniform"], 30, "calibration"))
