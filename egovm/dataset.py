@@ -21,6 +21,7 @@ from torch.utils.data import Dataset
 from egovm.batch import SURFEL, TYPES, Batch, Points, Truth
 from egovm.config import NetworkConfig
 from egovm.made_samples import Recipe, Split, sample_of
+from egovm.map_contents import MapContent, with_content
 from egovm.map_elements import Pieces, padded, pieces_around
 from egovm.sample import Sample
 from egovm.semantic_rasters import semantic_rasters
@@ -172,7 +173,10 @@ class TrainingBatches(Dataset[tuple[Batch, Truth]]):
 
 @dataclass(frozen=True)
 class EvaluationBatches(Dataset[tuple[Batch, Truth]]):
-    """Samples of a split one by one, each from an initial pose of its own number; nothing is turned or drawn."""
+    """Samples of a split one by one, each from an initial pose of its own number; nothing is turned or drawn.
+
+    content: what of the map is there.
+    """
 
     recipe: Recipe
     config: NetworkConfig
@@ -181,6 +185,7 @@ class EvaluationBatches(Dataset[tuple[Batch, Truth]]):
     split: Split = "held-out"
     seed: int = 0
     cache: Path | None = None
+    content: MapContent = "full"
 
     def __len__(self) -> int:
         return self.count
@@ -189,8 +194,9 @@ class EvaluationBatches(Dataset[tuple[Batch, Truth]]):
         if not 0 <= number < self.count:
             raise IndexError(number)
         rng = np.random.default_rng([self.seed, *b"judged", number])
-        sample = sample_of(self.recipe, self.split, number, self.cache)
-        return batched([seen_from_off(sample, self.noise.draw(rng), self.config, semantic=False)], self.config)
+        offset = self.noise.draw(rng)
+        sample = with_content(sample_of(self.recipe, self.split, number, self.cache), self.content, rng)
+        return batched([seen_from_off(sample, offset, self.config, semantic=False)], self.config)
 
 
 def loader(batches: Dataset[tuple[Batch, Truth]], numbers: Sequence[int], workers: int) -> Any:

@@ -1,5 +1,6 @@
 """Batches: whoever knows the truth finds the offset; noise, turns and batches are as said and of their seed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,12 @@ from egovm.dataset import (
     thinned,
     turned,
 )
+from egovm.evaluate import InTurns
 from egovm.judging import judged
 from egovm.lattice import seen_from
 from egovm.losses import LossConfig, network_losses
 from egovm.made_samples import made_sample
+from egovm.map_contents import CONTENTS, MapContent
 from egovm.map_elements import Pieces, places_of
 from egovm.pose_solver import PoseSolver
 from egovm.sample import Sample
@@ -182,3 +185,31 @@ def test_frames_of_evaluation_are_neither_turned_nor_those_of_training(made_cach
     np.testing.assert_allclose(batch.points.xyz.numpy(), expected, atol=0.0011)
     with pytest.raises(IndexError):
         batches[3]
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+def test_a_poorer_map_leaves_the_initial_pose_and_the_points(content: MapContent, made_cache: Path) -> None:
+    full = EvaluationBatches(RECIPE, NETWORK, NOISES["gauss"], 3, cache=made_cache)
+    batch, truth = replace(full, content=content)[1]
+    again, _ = replace(full, content=content)[1]
+    expected, offset = full[1]
+    assert torch.equal(truth.offset, offset.offset)
+    assert batch.points is not None
+    assert expected.points is not None
+    assert torch.equal(batch.points.xyz, expected.points.xyz)
+    assert torch.equal(batch.elements.ends, again.elements.ends)
+    fewer = int(batch.elements.valid.sum()) < int(expected.elements.valid.sum())
+    assert fewer == (content != "full")
+
+
+def test_calibrations_take_turns_in_every_world(made_cache: Path) -> None:
+    """Noise and map change from frame to frame, and each pair of them meets every world."""
+    base = EvaluationBatches(RECIPE, NETWORK, NOISES["uniform"], 30, "calibration", cache=made_cache)
+    several = tuple(replace(base, noise=InitialNoise(lon_m=lon, lat_m=0.0, yaw_deg=0.0)) for lon in (0.5, 1.0, 2.0))
+    turns = InTurns(several)
+    assert len(turns) == 30
+
+    met = {(number % RECIPE.worlds, turns.turn(number)) for number in range(30)}
+    assert met == {(world, turn) for world in range(RECIPE.worlds) for turn in range(3)}
+    for number in (0, 1, 2):
+        assert torch.equal(turns[number][1].offset, several[turns.turn(number)][number][1].offset)
