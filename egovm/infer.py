@@ -9,6 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from egovm.batch import Batch
+from egovm.calibration import read_calibration
 from egovm.convolutions import deployed
 from egovm.frame_inputs import FrameInputs, frame_inputs, lifted_axes
 from egovm.map_elements import Pieces, padded, pieces_around
@@ -40,6 +41,7 @@ class Matcher:
         network = EgoVM(self.config)
         load_weights(network, weights)
         self._network: Any = deployed(network)
+        self._calibration = read_calibration(weights, self.config.solver.lattice)
         self._map_m = 1.5 * self.config.bev.half_m
 
     def __call__(
@@ -67,14 +69,13 @@ class Matcher:
         T_body_lifted = lifted_axes(inputs.lifts[0])
         pieces = self._pieces(vector_map, T_map_init @ T_body_lifted)
         batch = output = None
-        lattice = self.config.solver.lattice
         if not _holds_data(inputs):
-            answer = nothing(NO_DATA, T_map_init, lattice.levels, len(pieces))
+            answer = nothing(NO_DATA, T_map_init, self.config.solver.lattice.levels, len(pieces))
         else:
             batch = Batch(inputs.points, inputs.images, padded([pieces]))
             output = self._run(batch, search, semantics=semantics)
             assert isinstance(output.estimate, PoseEstimate)
-            answer = answer_of(output.estimate, T_map_init, T_body_lifted, lattice)
+            answer = answer_of(output.estimate, T_map_init, T_body_lifted, self._calibration)
             answer = answer._replace(contribution=answer.contribution[: len(pieces)])
         return Match(
             t_ns=frame.t_ns,

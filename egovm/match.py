@@ -1,25 +1,22 @@
 """What one frame says of the pose: Match, read off the network's estimate.
 
-The pose is T_init dT, six degrees of which a match decides three: x, y and yaw. The covariance is the last level's,
-along directions in which a coarser level was flat that one's as well (``sensors.histogram``), in map axes.
+The pose is T_init dT, six degrees of which a match decides three: x, y and yaw. The covariance is what the calibrated
+histograms state (``egovm.calibration``), in map axes.
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from egovm.batch import Batch
-from egovm.config import LatticeConfig
+from egovm.calibration import Calibration, stated
 from egovm.dataset import planar
-from egovm.lattice import candidates
 from egovm.map_elements import Pieces
 from egovm.network import Output
 from egovm.pose_solver import PoseEstimate
-from sensors.histogram import stated_covariance
 from sensors.records import PoseFix
 
 Floats = NDArray[np.float64]
@@ -50,8 +47,8 @@ class Match:
     T_map_init: (4, 4) where the search began, T_map_body: (4, 4) where it ended; cov: (3, 3) in (m, m, rad), map axes;
     modes: (2, 3) the two strongest modes of the first level's histogram as map x, map y m, yaw rad, the stronger first,
     NaN where there is none; weights: (2,) their masses.
-    levels: (L, 3, 3) covariances in body axes at the levels' centres; landmarks: (L,) pieces of map that each level
-    used; contribution: (K,) what the last level's score would lose without each piece; seconds: of all of it.
+    levels: (L, 3, 3) calibrated covariances in body axes at the levels' centres; landmarks: (L,) pieces of map used by
+    each; contribution: (K,) what the last level's score would lose without each piece; seconds: of all of it.
     pieces: of map, in lifted axes (``frame_inputs``) at the initial pose; T_body_lifted: (4, 4). batch, output: what
     went into the network and came out of it, one frame; None where it was not run.
     """
@@ -108,7 +105,7 @@ def nothing(reason: str, T_map_init: Floats, levels: int, pieces: int) -> Answer
     return Answer(reason, T_map_init, unknown, *none, np.zeros(pieces))
 
 
-def answer_of(estimate: PoseEstimate, T_map_init: Floats, T_body_lifted: Floats, lattice: LatticeConfig) -> Answer:
+def answer_of(estimate: PoseEstimate, T_map_init: Floats, T_body_lifted: Floats, calibration: Calibration) -> Answer:
     """What the estimate of one frame says. Its offsets are of the lifted axes."""
     found = bool(estimate.found[0])
     landmarks = np.array([int(level.landmarks[0]) for level in estimate.levels], np.int64)
@@ -123,24 +120,11 @@ def answer_of(estimate: PoseEstimate, T_map_init: Floats, T_body_lifted: Floats,
     weights = weights / max(weights.sum(), 1.0)  # float32
     modes = np.where(weights[:, None] > 0.0, [planar_of(mode) for mode in T[1:]], np.nan)
     raw = np.stack([_array(level.cov[0]) for level in estimate.levels])
-    levels = raw
-    yaw = planar_of(T_map_lifted)[2] + np.array([float(level.centre[0, 2]) for level in estimate.levels])
-    R = np.stack([planar(np.array((0.0, 0.0, angle)))[:3, :3] for angle in yaw])
-    cov = _stated(R @ raw @ R.transpose(0, 2, 1), R[-1] @ levels[-1] @ R[-1].T, lattice)
-    return Answer("", T[0], cov, modes, weights, levels, landmarks, contribution)
-
-
-def _stated(raw: Floats, last: Floats, lattice: LatticeConfig) -> Floats:
-    """(3, 3) the last level's calibrated covariance, and what levels that were flat add to it.
-
-    raw: (L, 3, 3) of the histograms: they show which are flat.
-    """
-    flat = [
-        candidates(lattice, level, torch.zeros((), dtype=torch.float64)).flatten(0, 2).std(0, correction=0).numpy()
-        for level in range(lattice.levels)
-    ]
-    stated: Floats = last + stated_covariance(raw[None], np.stack(flat))[0] - raw[-1]
-    return 0.5 * (stated + stated.T)
+    turned = np.array([float(level.centre[0, 2]) for level in estimate.levels])
+    R = planar(np.array((0.0, 0.0, planar_of(T_map_lifted)[2] + turned[-1])))[:3, :3]
+    cov = R @ stated(calibration, raw[None], turned[None])[0] @ R.T
+    levels = calibration.of_levels(raw)
+    return Answer("", T[0], 0.5 * (cov + cov.T), modes, weights, levels, landmarks, contribution)
 
 
 def _array(values: Tensor) -> Floats:

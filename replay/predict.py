@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovm.infer import Matcher
-from egovm.match import Match
+from egovm.match import Match, planar_of
 from replay.config import RunConfig
 from replay.initial_poses import InitialPoses, KnownPoses, initial_poses
+from replay.match_drawing import Pictured
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.frames import Frame
@@ -21,7 +22,6 @@ from sensors.maps.map_file import MapFile
 from sensors.mcap.frames import read_frames
 from sensors.mcap.io import read_pieces, write_log
 from sensors.mcap.topics import CAMERA, FRAMES, LIDAR
-from sensors.motion import Motion
 from sensors.pieces import joined
 from sensors.records import Log, PoseFix
 
@@ -41,15 +41,6 @@ class Setting(NamedTuple):
     seed: int
     ground_m: float | None
     config: RunConfig
-
-
-class Pictured(NamedTuple):
-    """A match to look at. motion: of the vehicle around the frame; truth: (4, 4) T_map_body as the reference has it."""
-
-    frame: Frame
-    motion: Motion
-    match: Match
-    truth: Floats | None
 
 
 @dataclass(slots=True)
@@ -199,7 +190,7 @@ class _Matching:
         match = setting.matcher(frame, setting.vector_map, T, motion, ground_m=setting.ground_m, semantics=wanted)
         self.tally.add(match)
         if wanted:
-            self._chosen.seen.append(Pictured(frame, motion, match, self._true_pose(frame)))
+            self._chosen.seen.append(Pictured(match, setting.matcher.config.bev, self._true_pose(frame), frame, motion))
         fix = at_point(match.fix(), match.T_map_body[:2, :3] @ self._arm)
         if len(fix):
             self._starts.take(fix)
@@ -211,7 +202,7 @@ class _Matching:
 
     def _true_pose(self, frame: Frame) -> Floats | None:
         found = None if self._truth is None else self._truth.at(frame)
-        return None if found is None or isinstance(found, str) else found.T_map_body
+        return None if found is None or isinstance(found, str) else planar_of(found.T_map_body)
 
 
 def at_point(fix: PoseFix, apart: Floats) -> PoseFix:

@@ -1,5 +1,6 @@
 """egoloc predict: EgoVM along a log."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +65,8 @@ class Predict:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Match, write, draw, and say what was found."""
+        # as in training: threads that wait for each other on a busy machine take the cores from what they wait for
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         from egovm.infer import Matcher
         from egovm.weights import weights_path
         from replay.config import RunConfig, load_config
