@@ -1,9 +1,11 @@
-"""Dot products of embeddings with patches of a BEV map, channels last, and their gradients: loops for the CPU.
+"""Dot products of embeddings with patches of a BEV map, channels last, their gradients, and their sums over points at
+each candidate: loops for the CPU.
 
 Features are read where they lie: gathering the patches first moves ten times as much memory and takes four times as
 long. What the innermost loops walk along is taken as a view before them, so that they are vectorized.
 """
 
+import math
 from typing import Any
 
 from sensors.kernel import kernel
@@ -76,3 +78,32 @@ def add_feature_gradient(embeddings: Any, corners: Any, valid: Any, gradient: An
                         cell, weight = cells[column + c, g], line[c]
                         for k in range(channels):
                             cell[k] += weight * embedding[k]
+
+
+@kernel(nogil=True, fastmath=_SUMS)
+def add_lattice_sums(dots: Any, local: Any, size: int, into: Any) -> None:
+    """Add to into (B, yaw, n S) the points' dots (B, N, S S), read bilinearly around where each lies in its patch.
+
+    local: (B, N, yaw, 2) row and column in the patch; candidate (i, j) reads i rows and j columns beyond it. The last
+    S - n columns of into mean nothing: they let one loop run through all rows.
+    """
+    samples, points, yaws, _ = local.shape
+    steps = into.shape[2] // size
+    for b in range(samples):
+        for n in range(points):
+            for yaw in range(yaws):
+                row, column = _first(local[b, n, yaw, 0], size - steps), _first(local[b, n, yaw, 1], size - steps)
+                down, right = local[b, n, yaw, 0] - row, local[b, n, yaw, 1] - column
+                first, second = (1 - down) * (1 - right), (1 - down) * right
+                third, fourth = down * (1 - right), down * right
+                corner, flat = row * size + column, into[b, yaw]
+                above, beside = dots[b, n, corner:], dots[b, n, corner + 1 :]
+                below, across = dots[b, n, corner + size :], dots[b, n, corner + size + 1 :]
+                for k in range((steps - 1) * size + steps):
+                    flat[k] += first * above[k] + second * beside[k] + third * below[k] + fourth * across[k]
+
+
+@kernel(inline="always")
+def _first(place: Any, room: int) -> int:
+    """The cell before a place, such that what is read lies on the patch."""
+    return min(max(int(math.floor(place)), 0), room - 1)
