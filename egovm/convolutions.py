@@ -6,6 +6,8 @@ import torch
 from torch import fx, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from egovm.memory import keep_freed_memory
+
 
 def convolution(before: int, after: int, stride: int = 1) -> nn.Sequential:
     """3x3 convolution, batch norm and ReLU; cells become stride times as wide."""
@@ -23,8 +25,10 @@ def deployed(network: nn.Module, precision: torch.dtype | None = None) -> nn.Mod
     """A copy that runs faster and gives the same: in eval mode, batch norms folded into the convolutions before them,
     weights laid out by pixel (channels_last).
 
-    precision: in which the BEV side computes, None: that of the weights. What comes after it stays in float32.
+    precision: in which the BEV side computes, None: that of the weights. What comes after it stays in float32. From
+    here on the process keeps memory that it frees (``egovm.memory``).
     """
+    keep_freed_memory()
     found = copy.deepcopy(network).eval()
     for module in list(found.modules()):
         if isinstance(module, nn.Sequential):

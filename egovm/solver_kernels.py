@@ -15,18 +15,26 @@ _SUMS = {"reassoc", "contract"}
 
 
 @kernel(nogil=True, fastmath=_SUMS)
-def dot_patches(features: Any, embeddings: Any, corners: Any, valid: Any, dots: Any) -> None:
+def dot_patches(features: Any, embeddings: Any, corners: Any, valid: Any, order: Any, dots: Any) -> None:
     """Fill dots (B, N, G, S, S) of valid points: of each of G groups of channels, over a patch.
 
     features: (B, H, W, G, C); embeddings: (B, N, G, C); corners: (B, N, 2) int64 first row and column of the patch;
-    valid: (B, N) bool.
+    valid: (B, N) bool; order: (B, N) in which the points are taken, neighbours after each other so that what they share
+    is still in the cache. A point that asks for the same as the one before it, as both ends of a surfel do, has its
+    dots.
     """
     samples, points, groups, size, _ = dots.shape
     channels = features.shape[4]
     for b in range(samples):
-        for n in range(points):
+        before = -1
+        for m in range(points):
+            n = order[b, m]
             if not valid[b, n]:
                 continue
+            if before >= 0 and _same(corners[b], embeddings[b], n, before):
+                _copy(dots[b, before], dots[b, n])
+                continue
+            before = n
             row, column = corners[b, n, 0], corners[b, n, 1]
             for g in range(groups):
                 embedding = embeddings[b, n, g]
@@ -38,6 +46,27 @@ def dot_patches(features: Any, embeddings: Any, corners: Any, valid: Any, dots: 
                         for k in range(channels):
                             total += cell[k] * embedding[k]
                         line[c] = total
+
+
+@kernel()
+def _same(corners: Any, embeddings: Any, first: int, second: int) -> bool:
+    """Corners (N, 2) and embeddings (N, G, C) of two points are equal."""
+    if corners[first, 0] != corners[second, 0] or corners[first, 1] != corners[second, 1]:
+        return False
+    for g in range(embeddings.shape[1]):
+        for k in range(embeddings.shape[2]):
+            if embeddings[first, g, k] != embeddings[second, g, k]:
+                return False
+    return True
+
+
+@kernel()
+def _copy(dots: Any, to: Any) -> None:
+    """Those (G, S, S) of a point to another."""
+    for g in range(dots.shape[0]):
+        for r in range(dots.shape[1]):
+            for c in range(dots.shape[2]):
+                to[g, r, c] = dots[g, r, c]
 
 
 @kernel(nogil=True, fastmath=_SUMS)
