@@ -69,16 +69,13 @@ class ImageAttention(nn.Module):
 
         All images lie below one another in one map, a row of zeros after each, so that one call reads them all.
         """
-        heads = self.attention.heads
         height, width = features.shape[-2:]
         row, column = places.unbind(-1)
         inside = (row > -1.0) & (row < height) & (column > -1.0) & (column < width)
         below = torch.stack((row + (image * (height + 1))[:, None, None], column), -1)
-        values = self.attention.valued(features.flatten(0, 1))
-        apart = nn.functional.pad(values, (0, 0, 0, 1))
-        stacked = apart.transpose(0, 1).reshape(heads, -1, apart.shape[0] * (height + 1), width)
-        read = deformable_sum(stacked, below.transpose(0, 1), (weights * inside).transpose(0, 1))
-        return read.transpose(0, 1).flatten(1)
+        values = self.attention.valued(features.flatten(0, 1).permute(0, 2, 3, 1))
+        apart = nn.functional.pad(values, (0, 0, 0, 0, 0, 0, 0, 1)).flatten(0, 1)
+        return deformable_sum(apart[None], below[None], (weights * inside)[None])[0].flatten(1)
 
 
 class FusionLayer(nn.Module):
@@ -100,7 +97,7 @@ class FusionLayer(nn.Module):
         """(B, Q, C) queries after the layer. own: (1, Q, 1, 2) their cells; cells and seen: as ImageAttention's."""
         side = round(x.shape[1] ** 0.5)
         normed = self.norms[0](x)
-        plane = normed.transpose(1, 2).reshape(len(x), -1, side, side)
+        plane = normed.unflatten(1, (side, side))
         x = x + self.around(normed + position, own.expand(len(x), -1, -1, -1), plane)
         x = x + self.images(self.norms[1](x) + position, features, cells, seen)
         found: Tensor = x + self.feed(self.norms[2](x))

@@ -4,6 +4,7 @@ Axes of the maps: ``egovm.bev_grid``. One set of weights serves every mode: a fr
 learned queries, a frame without a valid image is not fused; in training either is left out now and then.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import torch
@@ -32,6 +33,8 @@ class BevNetwork(nn.Module):
         self.lidar = None if config.lidar is None else LidarEncoder(config.lidar, config.bev)
         self.queries = GridEmbedding(config.bev.cells(0), config.bev.channels[0])
         self.pyramid = BevPyramid(config)
+        self.precision: torch.dtype | None = None
+        """Of convolutions and matrix products where it is not the weights' own; maps are given in float32 then."""
 
     def forward(self, points: Points | None, images: Images | None) -> tuple[Tensor, ...]:
         """Maps of all levels. What the network has no encoder for is not looked at.
@@ -43,11 +46,17 @@ class BevNetwork(nn.Module):
         frames = _frames(points, images)
         if self.training:
             points, images = self._some(points, images)
-        bev, fine = self._started(points, frames)
-        if images is not None and self.camera is not None and self.fusion is not None:
-            bev = self.fusion(bev, self.camera(images.rgb), images)
-        maps: tuple[Tensor, ...] = self.pyramid(bev, fine)
-        return maps
+        with self._precise():
+            bev, fine = self._started(points, frames)
+            if images is not None and self.camera is not None and self.fusion is not None:
+                bev = self.fusion(bev, self.camera(images.rgb), images)
+            maps: tuple[Tensor, ...] = self.pyramid(bev, fine)
+        return maps if self.precision is None else tuple(level.float() for level in maps)
+
+    def _precise(self) -> AbstractContextManager[object]:
+        if self.precision is None:
+            return nullcontext()
+        return torch.autocast(self.queries.rows.device.type, self.precision)
 
     def _started(self, points: Points | None, frames: int) -> tuple[Tensor, Tensor | None]:
         """BEV queries (B, C, H, W): LiDAR features, or learned ones of frames without points; and the pillars'."""
@@ -56,6 +65,8 @@ class BevNetwork(nn.Module):
         if points is None or self.lidar is None:
             return learned.expand(frames, -1, -1, -1), None
         seen = self.lidar(points)
+        if not (self.training or torch.compiler.is_exporting()) and seen.present.all():
+            return seen.features, seen.fine
         present = seen.present[:, None, None, None]
         return torch.where(present, seen.features, learned), seen.fine * present
 

@@ -39,7 +39,9 @@ class PillarEncoder(nn.Module):
         self.grid = BevGrid(round(2.0 * bev.half_m / config.cell_m), config.cell_m)
         self.z_m = bev.z_m
         width = config.channels[0]
-        self.layers = nn.Sequential(nn.Linear(_POINT, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.layers = nn.Sequential(
+            nn.Linear(_POINT, width), nn.ReLU(inplace=True), nn.Linear(width, width), nn.ReLU(inplace=True)
+        )
 
     def forward(self, points: Points) -> tuple[Tensor, Tensor]:
         """Pillars (B, C, n, n), zero where there is no point, and (B,) bool of frames that have points in range."""
@@ -49,25 +51,27 @@ class PillarEncoder(nn.Module):
         low, high = self.z_m
         height = points.xyz[:, 2]
         keep = ((nearest >= 0) & (nearest < n)).all(-1) & (height >= low) & (height < high)
-        index = ((points.frame * n + nearest[:, 0]) * n + nearest[:, 1])[keep]
-        known = self._known(points, cells - nearest, keep, index)
+        kept = keep.nonzero()[:, 0]
+        frame, nearest = points.frame.index_select(0, kept), nearest.index_select(0, kept)
+        index = (frame * n + nearest[:, 0]) * n + nearest[:, 1]
+        part = cells.index_select(0, kept) - nearest
+        known = self._known(points.xyz.index_select(0, kept), points.intensity[kept], part, index, points.frames)
         canvas = known.new_zeros(points.frames * n * n, known.shape[1])
         canvas = canvas.scatter_reduce_(0, index[:, None].expand_as(known), known, "amax")
         count = torch.zeros(points.frames, dtype=torch.int64, device=index.device)
-        present = count.index_add(0, points.frame[keep], torch.ones_like(index)) > 0
+        present = count.index_add(0, frame, torch.ones_like(frame)) > 0
         return canvas.reshape(points.frames, n, n, -1).permute(0, 3, 1, 2), present
 
-    def _known(self, points: Points, part: Tensor, keep: Tensor, index: Tensor) -> Tensor:
-        """(P, C) of points that are kept. part: (all, 2) where a point lies in its pillar, in cells."""
-        xyz = points.xyz[keep]
+    def _known(self, xyz: Tensor, intensity: Tensor, part: Tensor, index: Tensor, frames: int) -> Tensor:
+        """(P, C) of points in the pillars of index (P,). part: (P, 2) where a point lies in its pillar, in cells."""
         # sum and count at once: ONNX has no mean of what is scattered
         counted = torch.cat((xyz, torch.ones_like(xyz[:, :1])), -1)
-        empty = xyz.new_zeros(points.frames * self.grid.cells**2, 4)
-        total = empty.scatter_reduce_(0, index[:, None].expand_as(counted), counted, "sum")[index]
+        empty = xyz.new_zeros(frames * self.grid.cells**2, 4)
+        total = empty.scatter_reduce_(0, index[:, None].expand_as(counted), counted, "sum").index_select(0, index)
         mean = total[:, :3] / total[:, 3:]
         low, high = self.z_m
         height = (2.0 * xyz[:, 2:] - (low + high)) / (high - low)
-        parts = (2.0 * part[keep], (xyz - mean) / self.grid.cell_m, height, points.intensity[keep, None])
+        parts = (2.0 * part, (xyz - mean) / self.grid.cell_m, height, intensity[:, None])
         # a point alone in its pillar is told from one in the middle of many
         alone = (total[:, 3:] == 1.0).to(xyz.dtype)
         known: Tensor = self.layers(torch.cat((*parts, alone), -1))

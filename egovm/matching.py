@@ -43,10 +43,11 @@ class DecoderLayer(nn.Module):
         self.bev = DeformableAttention(channels, heads, points, references)
         self.hidden = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
 
-    def forward(self, queries: Tensor, valid: Tensor, cells: Tensor, bev: Tensor) -> Tensor:
-        """(B, K, C) of queries (B, K, C). cells: (B, K, R, 2) rows and columns in bev (B, C, H, W)."""
+    def forward(self, queries: Tensor, valid: Tensor, cells: Tensor, bev: Tensor, position: Tensor) -> Tensor:
+        """(B, K, C) of queries (B, K, C). cells: (B, K, R, 2) rows and columns in bev (B, H, W, C); position:
+        (H, W, C + 1) added to it, and a 1."""
         queries = queries + self.elements(self.before_elements(queries), valid)
-        queries = queries + self.bev(self.before_bev(queries), cells, bev)
+        queries = queries + self.bev.read_first(self.before_bev(queries), cells, bev, position)
         result: Tensor = queries + self.hidden(self.before_hidden(queries))
         return result
 
@@ -72,7 +73,10 @@ class Matching(nn.Module):
             nn.Sequential(nn.Linear(first, first), nn.ReLU(), nn.Linear(first, channels))
             for channels in config.bev.channels
         )
-        self.register_buffer("position", sine_positions(self.grid.cells, first), persistent=False)
+        position = sine_positions(self.grid.cells, first).permute(1, 2, 0)
+        # the 1 behind it: see DeformableAttention.read_first
+        known = torch.cat((position, torch.ones_like(position[..., :1])), -1)
+        self.register_buffer("position", known, persistent=False)
 
     def forward(self, elements: MapElements, bev: Tensor) -> tuple[Tensor, ...]:
         """Map embeddings (B, K, C) of each level, 0 where an element is not valid. bev: (B, C, H, W) of level 0."""
@@ -80,9 +84,9 @@ class Matching(nn.Module):
         looked_at = elements.ends[..., :2]
         looked_at = looked_at.mean(2, keepdim=True) if self.at_middle else looked_at
         cells = self.grid.cells_from_m(looked_at).to(queries.dtype)
-        seen = bev + self.position if len(self.layers) else bev
+        seen = bev.permute(0, 2, 3, 1)
         for layer in self.layers:
-            queries = layer(queries, elements.valid, cells, seen)
+            queries = layer(queries, elements.valid, cells, seen, self.position)
         matched = self.last(queries)
         kept = elements.valid[..., None]
         return tuple(torch.where(kept, level(matched), torch.zeros_like(matched[..., :1])) for level in self.levels)

@@ -11,6 +11,10 @@ from egovm.solver_kernels import add_embedding_gradient, add_feature_gradient, d
 
 _CHUNK = 64
 """Points whose patches torch gathers at once: 30 MB at 256 channels."""
+_STRIP = 16
+"""Rows of a strip of the map."""
+_WIDEST = 1 << 20
+"""More than any map has columns."""
 
 
 def patch_dots(
@@ -45,7 +49,7 @@ def _patch_dots(features: Tensor, embeddings: Tensor, corners: Tensor, valid: Te
         return gathered_dots(features, embeddings, corners, valid, size, groups)
     samples, points = valid.shape
     dots = embeddings.new_zeros((samples, points, groups, size, size))
-    dot_patches(*_arrays(_split(features, groups), _split(embeddings, groups), corners, valid, dots))
+    dot_patches(*_arrays(_split(features, groups), _split(embeddings, groups), corners, valid, _order(corners), dots))
     return dots
 
 
@@ -104,6 +108,11 @@ def _by_kernel(features: Tensor, embeddings: Tensor) -> bool:
 def _arrays(*tensors: Tensor) -> list[object]:
     """Contiguous numpy views: other strides would each be compiled anew."""
     return [each.detach().contiguous().numpy() for each in tensors]
+
+
+def _order(corners: Tensor) -> Tensor:
+    """(B, N) of points (B, N, 2) by strips of the map, along each by column; equal ones stay in their order."""
+    return (corners[..., 0] // _STRIP * _WIDEST + corners[..., 1]).argsort(dim=1, stable=True)
 
 
 def _split(channels: Tensor, groups: int) -> Tensor:

@@ -13,6 +13,7 @@ from torch import Tensor
 from egovm.config import LatticeConfig
 from egovm.lattice import rotated, seen_from, yaws
 from egovm.solver_dots import patch_dots
+from egovm.solver_sums import can_sum, lattice_sums
 from sensors.errors import EgolocError
 
 
@@ -102,6 +103,17 @@ def lattice_dots(window: Window) -> Tensor:
 
 def summed_lattice_dots(window: Window) -> Tensor:
     """Sum (B, yaw, x, y) over the elements and groups of their dots: as ``lattice_dots``, but no element is kept."""
+    local = _local(window)
+    if can_sum(window.dots, local):
+        summed: Tensor = lattice_sums(
+            window.dots.flatten(1, 2), local.flatten(1, 2), 1.0 / local.shape[2], window.lattice.steps
+        )
+        return summed
+    return gathered_lattice_dots(window)
+
+
+def gathered_lattice_dots(window: Window) -> Tensor:
+    """The same in plain torch: with gradients, and in exports."""
     patches, weights = _read(window)
     below, steps = window.lattice.steps, window.lattice.steps + 1
     patches = patches.sum(3).flatten(1, 2).transpose(1, 2)
@@ -177,10 +189,7 @@ def _read(window: Window) -> tuple[Tensor, Tensor]:
     Patches (B, K, P, G, yaw, (steps + 1)^2) and weights (B, K, P, 1, yaw, 4). Translations run against the cells:
     the first row belongs to the largest t.
     """
-    size, reach = window.dots.shape[-1], window.lattice.reach
-    around = yaws(window.lattice, window.level, window.places)
-    local = _cells(window.lattice, window.level, window.places[:, :, :, None], around, window.cells)
-    local = local - window.corners[:, :, :, None] - reach
+    size, local = window.dots.shape[-1], _local(window)
     base = torch.floor(local.detach()).clamp(0.0, size - window.lattice.steps - 1.0)
     weights = _weights(local - base)
     steps = torch.arange(window.lattice.steps + 1, device=base.device)
@@ -188,4 +197,11 @@ def _read(window: Window) -> tuple[Tensor, Tensor]:
     index = (row * size + column)[..., None] + (steps[:, None] * size + steps).flatten()
     flat = index.flatten(3)[:, :, :, None].expand(-1, -1, -1, window.dots.shape[3], -1)
     patches = window.dots.flatten(4).gather(4, flat)
-    return torch.unflatten(patches, -1, (len(around), len(steps) ** 2)), weights[:, :, :, None]
+    return torch.unflatten(patches, -1, (local.shape[3], len(steps) ** 2)), weights[:, :, :, None]
+
+
+def _local(window: Window) -> Tensor:
+    """(B, K, P, yaw, 2) row and column in the patch of a point under each yaw, at the largest translation."""
+    around = yaws(window.lattice, window.level, window.places)
+    cells = _cells(window.lattice, window.level, window.places[:, :, :, None], around, window.cells)
+    return cells - window.corners[:, :, :, None] - window.lattice.reach

@@ -1,11 +1,12 @@
-"""What a vehicle with six cameras and a LiDAR sees, made up of noise: enough to time a network on."""
+"""What a vehicle with six cameras and a LiDAR sees, and a map around it, made up of noise: enough to time a network on."""
 
 import math
 
 import torch
 
-from egovm.batch import Images, Points
+from egovm.batch import SURFEL, TYPES, Batch, Images, MapElements, Points, Truth
 from egovm.config import NetworkConfig
+from sensors.maps.vector_map import Kind
 
 CAMERAS = 6
 POINTS = 60_000
@@ -14,12 +15,38 @@ _FOCAL = 0.8
 """Of an image's width: 64 deg across, so that neighbours overlap a little."""
 
 
-def scene(config: NetworkConfig) -> tuple[Points | None, Images | None]:
-    """One frame of what the config has encoders for."""
+def scene(config: NetworkConfig) -> Batch:
+    """One frame of what the config has encoders for, and as many map elements as it takes at most."""
     random = torch.Generator().manual_seed(1)
     points = None if config.lidar is None else _points(config.bev.half_m, random)
     images = None if config.camera is None else _images(config.camera.image_hw, random)
-    return points, images
+    return Batch(points, images, _elements(config, random))
+
+
+def truth(config: NetworkConfig) -> Truth:
+    """A true pose within the lattice, and one cell of a hundred drawn in each raster."""
+    random = torch.Generator().manual_seed(2)
+    sides = [config.bev.cells(level) for level in range(len(config.bev.channels))]
+    drawn = tuple(torch.rand(1, TYPES - 1, side, side, generator=random) < 0.01 for side in sides)
+    return Truth(torch.tensor([[0.3, -0.2, 0.01]]), drawn)
+
+
+def _elements(config: NetworkConfig, random: torch.Generator) -> MapElements:
+    """Half of them surfels where there are any, the rest of all kinds, up to 4.5 m from the plane's edge."""
+    count = config.matching.most_elements
+    type_ = torch.arange(count) % SURFEL
+    if config.ablation.surfels:
+        type_[::2] = SURFEL
+    stands = (type_ == SURFEL) | (type_ == Kind.POLE) | (type_ == Kind.SIGN)
+    middle = (config.bev.half_m - 4.5) * (2.0 * torch.rand(count, 2, generator=random) - 1.0)
+    angle = 2.0 * math.pi * torch.rand(count, generator=random)
+    along = 0.5 * config.matching.segment_m * torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    along[stands] = 0.0
+    ends = torch.stack((middle - along, middle + along), 1)
+    normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=-1)
+    ratios = torch.rand(count, 2, generator=random)
+    columns = type_, torch.nn.functional.pad(ends, (0, 1)), 5.0 * torch.rand(count, generator=random), normal, ratios
+    return MapElements(*(each[None] for each in columns), valid=torch.ones(1, count, dtype=torch.bool))
 
 
 def _points(half_m: float, random: torch.Generator) -> Points:

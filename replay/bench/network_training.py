@@ -1,4 +1,4 @@
-"""What one frame forward and backward through the BEV side of a preset costs a fresh process: seconds, and MB."""
+"""What one frame forward and backward through a whole preset, all losses with it, costs a fresh process: seconds, MB."""
 
 import subprocess
 import sys
@@ -6,10 +6,11 @@ import time
 
 import torch
 
-from egovm.bev_network import BevNetwork
 from egovm.config import PRESETS
+from egovm.losses import LossConfig, network_losses
+from egovm.network import EgoVM
 from replay.bench.memory import peak_mb
-from replay.bench.network_scene import scene
+from replay.bench.network_scene import scene, truth
 
 
 def training_step(preset: str) -> tuple[float, float]:
@@ -23,11 +24,16 @@ def _step(preset: str) -> float:
     """Seconds of one step with all sensors."""
     config = PRESETS[preset]
     torch.manual_seed(0)
-    network = BevNetwork(config).train()
-    network.drops = (0.0, 0.0)
-    points, images = scene(config)
+    network = EgoVM(config).to(memory_format=torch.channels_last).train()  # type: ignore[call-overload]
+    network.bev.drops = (0.0, 0.0)
+    batch, true = scene(config), truth(config)
     start = time.perf_counter()
-    torch.stack([found.square().mean() for found in network(points, images)]).sum().backward()  # type: ignore[no-untyped-call]
+    found = network(batch)
+    draw = torch.Generator().manual_seed(0)
+    losses = network_losses(
+        LossConfig(), config.ablation, true, found.estimate, network.solver, found.logits, draw
+    )
+    losses.total.backward()  # type: ignore[no-untyped-call]
     if not all(p.grad.isfinite().all() for p in network.parameters() if p.grad is not None):
         raise FloatingPointError(f"{preset}: a gradient is not finite")
     return time.perf_counter() - start

@@ -183,9 +183,9 @@ def test_gradients_of_the_decoder_are_those_of_finite_differences() -> None:
     def scalar(seen: Tensor, embeddings: Tensor) -> Tensor:
         queries = matching.encoder(given, embeddings)
         cells = matching.grid.cells_from_m(given.ends[..., :2])
-        return matching.layers[0](queries, given.valid, cells, seen) @ weight
+        return matching.layers[0](queries, given.valid, cells, seen, matching.position[:6, :6]) @ weight
 
-    seen = bev(1)[:, :, :6, :6].double().requires_grad_()
+    seen = bev(1)[:, :, :6, :6].permute(0, 2, 3, 1).double().requires_grad_()
     embeddings = matching.semantic().detach().requires_grad_()
     assert torch.autograd.gradcheck(scalar, (seen, embeddings), fast_mode=True)
 

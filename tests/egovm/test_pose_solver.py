@@ -10,7 +10,15 @@ from egovm.config import LatticeConfig
 from egovm.lattice import candidates
 from egovm.pose_solver import PoseSolver
 from egovm.solver_dots import gathered_dots, patch_dots
-from egovm.solver_window import dot_window, dots_at, in_window, lattice_dots, summed_lattice_dots
+from egovm.solver_sums import can_sum
+from egovm.solver_window import (
+    dot_window,
+    dots_at,
+    gathered_lattice_dots,
+    in_window,
+    lattice_dots,
+    summed_lattice_dots,
+)
 from tests.egovm.reference_solver import lattice_poses, solve, solve_level, vector
 from tests.egovm.solver_inputs import inputs
 
@@ -224,3 +232,41 @@ def test_groups_go_through_their_h() -> None:
     alike = solver.similarity[0](dots)
     wanted = torch.where(found.window.valid[:, None], alike, 0.0).sum(-1) / found.landmarks
     assert torch.allclose(by_pose, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_sums_by_the_kernel_are_those_of_torch(groups: int) -> None:
+    """Of points that ask for the same as others, and of elements that are not used."""
+    features, embeddings, places, valid = inputs(LATTICE, 2, 24, 2)
+    places = places.clone()
+    places[:, ::2, 1] = places[:, ::2, 0]
+    for level in range(3):
+        window = dot_window(LATTICE, level, features[level], embeddings[level], places, valid, groups)
+        assert 0 < int(window.valid.sum()) < window.valid.numel()
+        assert can_sum(window.dots, window.places)
+        gathered = gathered_lattice_dots(window)
+        assert gathered.abs().max() > 0.0
+        assert torch.allclose(summed_lattice_dots(window), gathered, atol=1e-10, rtol=0)
+
+
+def test_gradients_are_not_left_to_the_kernel() -> None:
+    features, embeddings, places, valid = inputs(LATTICE, 1, 4)
+    window = dot_window(LATTICE, 0, features[0].requires_grad_(), embeddings[0], places, valid)
+    assert not can_sum(window.dots, window.places)
+    assert summed_lattice_dots(window).requires_grad
+    with torch.no_grad():
+        assert can_sum(window.dots, window.places)
+
+
+def test_points_that_ask_for_the_same_have_the_same_dots() -> None:
+    """In any order; another embedding or another place is another point."""
+    draw = torch.Generator().manual_seed(5)
+    features = torch.randn(1, 20, 20, 8, generator=draw)
+    corners = torch.tensor([[[3, 4], [9, 2], [3, 4], [3, 4], [9, 2], [3, 4], [0, 11]]])
+    embeddings = torch.randn(1, 7, 8, generator=draw)
+    embeddings[0, 2], embeddings[0, 5] = embeddings[0, 0], embeddings[0, 0]
+    valid = torch.tensor([[True, True, True, True, True, False, True]])
+    found = patch_dots(features, embeddings, corners, valid, 8)
+    assert torch.allclose(found, gathered_dots(features, embeddings, corners, valid, 8, 1), atol=1e-5)
+    assert torch.equal(found[0, 2], found[0, 0])
+    assert not found[0, 5].any()
