@@ -76,7 +76,7 @@ class ImageAttention(nn.Module):
         below = torch.stack((row + (image * (height + 1))[:, None, None], column), -1)
         values = self.attention.valued(features.flatten(0, 1))
         apart = nn.functional.pad(values, (0, 0, 0, 1))
-        stacked = apart.transpose(0, 1).reshape(heads, -1, len(apart) * (height + 1), width)
+        stacked = apart.transpose(0, 1).reshape(heads, -1, apart.shape[0] * (height + 1), width)
         read = deformable_sum(stacked, below.transpose(0, 1), (weights * inside).transpose(0, 1))
         return read.transpose(0, 1).flatten(1)
 

@@ -7,7 +7,7 @@ run in all directions anyway.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from egovm.batch import Batch, Points, Truth
+from egovm.batch import SURFEL, TYPES, Batch, Points, Truth
 from egovm.config import NetworkConfig
 from egovm.made_samples import Recipe, Split, sample_of
+from egovm.map_contents import MapContent, with_content
 from egovm.map_elements import Pieces, padded, pieces_around
 from egovm.sample import Sample
 from egovm.semantic_rasters import semantic_rasters
@@ -66,6 +67,17 @@ NOISES = {
 """By name: the default, and the two that stand for what the paper does not tell."""
 
 
+class Augmentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What training changes in samples."""
+
+    turn_deg: Annotated[float, msgspec.Meta(ge=0.0, le=180.0)] = 10.0
+    """Body axes are turned by up to so much, deg."""
+    drop_surfels: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.3
+    """Part of the frames whose map has no surfels, as most maps."""
+    drop_kinds: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.1
+    """Part of the frames whose map lacks a kind of element, of each kind."""
+
+
 @dataclass(frozen=True, slots=True)
 class Seen:
     """A sample from one initial pose. T_map_init: (4, 4); offset: (3,) T_init^-1 T_true, x m, y m, yaw rad; semantic:
@@ -93,6 +105,13 @@ def seen_from_off(sample: Sample, offset: Floats, config: NetworkConfig, *, sema
     pieces = pieces_around(sample.elements, sample.surfels, T_map_init, config, sample.ground_m)
     drawn = semantic_rasters(sample.elements, sample.T_map_body, config.bev, sample.ground_m) if semantic else ()
     return Seen(sample, T_map_init, offset, pieces, drawn)
+
+
+def thinned(pieces: Pieces, given: Augmentation, rng: Rng) -> Pieces:
+    """The same without surfels, and without each other kind, by chance; all of them where none would be left."""
+    kept = rng.random(TYPES) >= np.where(np.arange(TYPES) == SURFEL, given.drop_surfels, given.drop_kinds)
+    rows = kept[pieces.type]
+    return pieces.chosen(rows) if rows.any() else pieces
 
 
 def planar(offset: Floats) -> Floats:
@@ -132,9 +151,8 @@ class TrainingBatches(Dataset[tuple[Batch, Truth]]):
     recipe: Recipe
     config: NetworkConfig
     noise: InitialNoise
+    augmentation: Augmentation
     batch: int
-    turn_deg: float
-    """Body axes are turned by up to so much, deg."""
     seed: int
     cache: Path | None = None
 
@@ -146,14 +164,19 @@ class TrainingBatches(Dataset[tuple[Batch, Truth]]):
             order = np.random.default_rng([self.seed, *b"epoch", epoch]).permutation(self.recipe.samples)
             rng = np.random.default_rng([self.seed, *b"seen", step, slot])
             sample = sample_of(self.recipe, "train", int(order[place]), self.cache)
-            sample = turned(sample, np.radians(rng.uniform(-self.turn_deg, self.turn_deg)))
-            several.append(seen_from_off(sample, self.noise.draw(rng), self.config, semantic=semantic))
+            most = np.radians(self.augmentation.turn_deg)
+            sample = turned(sample, rng.uniform(-most, most))
+            seen = seen_from_off(sample, self.noise.draw(rng), self.config, semantic=semantic)
+            several.append(replace(seen, pieces=thinned(seen.pieces, self.augmentation, rng)))
         return batched(several, self.config)
 
 
 @dataclass(frozen=True)
 class EvaluationBatches(Dataset[tuple[Batch, Truth]]):
-    """Samples of a split one by one, each from an initial pose of its own number; nothing is turned or drawn."""
+    """Samples of a split one by one, each from an initial pose of its own number; nothing is turned or drawn.
+
+    content: what of the map is there.
+    """
 
     recipe: Recipe
     config: NetworkConfig
@@ -162,6 +185,7 @@ class EvaluationBatches(Dataset[tuple[Batch, Truth]]):
     split: Split = "held-out"
     seed: int = 0
     cache: Path | None = None
+    content: MapContent = "full"
 
     def __len__(self) -> int:
         return self.count
@@ -170,8 +194,9 @@ class EvaluationBatches(Dataset[tuple[Batch, Truth]]):
         if not 0 <= number < self.count:
             raise IndexError(number)
         rng = np.random.default_rng([self.seed, *b"judged", number])
-        sample = sample_of(self.recipe, self.split, number, self.cache)
-        return batched([seen_from_off(sample, self.noise.draw(rng), self.config, semantic=False)], self.config)
+        offset = self.noise.draw(rng)
+        sample = with_content(sample_of(self.recipe, self.split, number, self.cache), self.content, rng)
+        return batched([seen_from_off(sample, offset, self.config, semantic=False)], self.config)
 
 
 def loader(batches: Dataset[tuple[Batch, Truth]], numbers: Sequence[int], workers: int) -> Any:

@@ -31,70 +31,78 @@ FULL_INTENSITY = 255.0
 
 
 class FrameInputs(NamedTuple):
-    """What a network takes of B frames; None where it has no encoder for it, or no frame has any."""
+    """What a network takes of B frames; None where it has no encoder for it, or no frame has any.
+
+    lifts: (B,) m, what is added to heights in body axes.
+    """
 
     points: Points | None
     images: Images | None
+    lifts: tuple[float, ...]
 
 
 def frame_inputs(
     frames: Sequence[Frame],
     config: NetworkConfig,
     motions: Sequence[Motion] | None = None,
-    lifts: Sequence[float] | None = None,
+    ground_m: float | None = None,
 ) -> FrameInputs:
-    """Frames for a network, one batch. motions: of each; None: the vehicle stood. lifts: ``lift_of`` each, m; None: 0.
+    """Frames for a network, one batch. motions: of each; None: the vehicle stood.
 
-
+    ground_m: height of the ground under the vehicle in body axes, m; None: that which the points of each frame show
+    (``projection.ground_under``), and where they show none the network's own, so that nothing is lifted.
     Cameras go by name, in the order in which they first appear; where a frame lacks one, its image is not valid.
     Raises EgolocError for no frames, a motion that does not cover its frame, and images that cannot be decoded.
     """
     moved = [Standing()] * len(frames) if motions is None else motions
-    lifted = [0.0] * len(frames) if lifts is None else lifts
-    if not frames or len(moved) != len(frames) or len(lifted) != len(frames):
+    if not frames or len(moved) != len(frames):
         raise EgolocError(f"frames: expected one or more and a motion for each, got {len(frames)} and {len(moved)}")
     for frame, motion in zip(frames, moved, strict=True):
         first, last = span_of(frame)
         if not motion.covers(first, last):
             raise EgolocError(f"frame at {frame.t_ns}: expected a motion known from {first} to {last} ns")
+    seen = [_places(frame, motion) for frame, motion in zip(frames, moved, strict=True)]
+    lifts = tuple(_lift(xyz, config.bev, ground_m) for xyz in seen)
     points = images = None
     if config.lidar is not None and any(frame.sweeps for frame in frames):
-        points = lidar_points(frames, config.bev, moved, lifted)
+        points = lidar_points(frames, seen, config.bev, lifts)
     if config.camera is not None and any(frame.images for frame in frames):
-        images = camera_images(frames, config.camera, moved, lifted)
-    return FrameInputs(points, images)
+        images = camera_images(frames, config.camera, moved, lifts)
+    return FrameInputs(points, images, lifts)
 
 
-def lift_of(frame: Frame, bev: BevConfig, ground_m: float | None = None) -> float:
-    """How far a frame's body axes are lifted to become lifted axes, m.
+def _places(frame: Frame, motion: Motion) -> Floats:
+    """(P, 3) m, body axes at the frame's time, of all its points."""
+    parts = [points_at(sweep, frame.t_ns, motion, frame.t_ns) for sweep in frame.sweeps]
+    return parts[0] if len(parts) == 1 else np.concatenate([np.empty((0, 3)), *parts])
 
-    ground_m: height of the ground under the vehicle in body axes, m; None: that which its points show
-    (``projection.ground_under``), and where they show none the network's own, so that nothing is lifted.
-    """
-    if ground_m is None and frame.sweeps:
-        ground_m = ground_under(np.concatenate([sweep.in_body() for sweep in frame.sweeps]))
+
+def _lift(xyz: Floats, bev: BevConfig, ground_m: float | None) -> float:
+    ground_m = ground_under(xyz) if ground_m is None else ground_m
     return 0.0 if ground_m is None else bev.ground_m - ground_m
 
 
-def lidar_points(frames: Sequence[Frame], bev: BevConfig, motions: Sequence[Motion], lifts: Sequence[float]) -> Points:
-    """The points over the BEV plane, at the heights that are used, of all sweeps."""
-    parts = [_points(*each, bev) for each in zip(frames, motions, lifts, strict=True)]
-    rows = torch.from_numpy(np.concatenate(parts).astype(np.float32))
+def lidar_points(frames: Sequence[Frame], places: Sequence[Floats], bev: BevConfig, lifts: Sequence[float]) -> Points:
+    """The points over the BEV plane, at the heights that are used. places: of each frame, (P, 3) m in body axes."""
+    parts = [_points(*each, bev) for each in zip(frames, places, lifts, strict=True)]
+    rows = torch.from_numpy(np.concatenate(parts))
     which = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor([len(part) for part in parts]))
     return Points(rows[:, :3], rows[:, 3], rows[:, 4], which, len(parts))
 
 
-def _points(frame: Frame, motion: Motion, lift: float, bev: BevConfig) -> Floats:
+def _points(frame: Frame, xyz: Floats, lift: float, bev: BevConfig) -> NDArray[np.float32]:
     """(P, 5) x y z m, intensity 0..1 and s from the frame's time, of one frame."""
-    found = [np.empty((0, 5))]
-    for sweep in frame.sweeps:
-        xyz = points_at(sweep, frame.t_ns, motion, frame.t_ns) + np.array((0.0, 0.0, lift))
-        intensity = np.clip(np.nan_to_num(sweep.intensity.astype(np.float64)) / FULL_INTENSITY, 0.0, 1.0)
-        rows = np.column_stack((xyz, intensity, sweep.offset_ns * 1e-9))
-        low, high = bev.z_m
-        on_plane = (np.abs(xyz[:, :2]) < bev.half_m).all(axis=1)
-        found.append(rows[on_plane & (xyz[:, 2] >= low) & (xyz[:, 2] < high)])
-    return np.concatenate(found)
+    x, y, z = xyz.T
+    low, high = bev.z_m[0] - lift, bev.z_m[1] - lift
+    kept = np.flatnonzero((np.abs(x) < bev.half_m) & (np.abs(y) < bev.half_m) & (z >= low) & (z < high))
+    found = np.empty((len(kept), 5), np.float32)
+    found[:, :3] = xyz[kept]
+    found[:, 2] += lift
+    if frame.sweeps:
+        intensity = np.concatenate([sweep.intensity for sweep in frame.sweeps])[kept]
+        found[:, 3] = np.clip(np.nan_to_num(intensity) / FULL_INTENSITY, 0.0, 1.0)
+        found[:, 4] = np.concatenate([sweep.offset_ns for sweep in frame.sweeps])[kept] * 1e-9
+    return found
 
 
 def camera_images(

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from egovm.batch import Batch
 from egovm.convolutions import deployed
-from egovm.frame_inputs import frame_inputs, lift_of, lifted_axes
+from egovm.frame_inputs import FrameInputs, frame_inputs, lifted_axes
 from egovm.map_elements import Pieces, padded, pieces_around
 from egovm.match import NO_DATA, Match, answer_of, nothing
 from egovm.network import EgoVM, Output
@@ -63,13 +63,12 @@ class Matcher:
         begin = time.perf_counter()
         T_map_init = np.asarray(T_map_init, np.float64)
         check_rigid("T_map_init", T_map_init)
-        lift = lift_of(frame, self.config.bev, ground_m)
-        T_body_lifted = lifted_axes(lift)
+        inputs = frame_inputs([frame], self.config, [motion or Standing()], ground_m)
+        T_body_lifted = lifted_axes(inputs.lifts[0])
         pieces = self._pieces(vector_map, T_map_init @ T_body_lifted)
-        inputs = frame_inputs([frame], self.config, [motion or Standing()], [lift])
         batch = output = None
         lattice = self.config.solver.lattice
-        if inputs.points is None and inputs.images is None:
+        if not _holds_data(inputs):
             answer = nothing(NO_DATA, T_map_init, lattice.levels, len(pieces))
         else:
             batch = Batch(inputs.points, inputs.images, padded([pieces]))
@@ -99,3 +98,9 @@ class Matcher:
         prior = None if search is None else torch.from_numpy(np.asarray(search, np.float32)[None])
         output: Output = self._network(batch, prior, semantics=semantics)
         return output
+
+
+def _holds_data(inputs: FrameInputs) -> bool:
+    """Whether there is a point over the BEV plane, or an image. Learned queries alone would make up a pose."""
+    points = inputs.points is not None and len(inputs.points.xyz) > 0
+    return points or (inputs.images is not None and bool(inputs.images.valid.any()))

@@ -1,58 +1,65 @@
-"""How far estimates are off: along and across the true heading, in yaw, and against the covariance they state."""
+"""How far estimates are off: along and across the true heading, in yaw; and level by level, beside the covariances."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from egovm.lattice import between, rotated
+from egovm.config import LatticeConfig
+from egovm.lattice import between
 from egovm.pose_solver import PoseEstimate
 from egovm.regression_solver import RegressedPose
+from egovm.solver_window import in_window
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Of B frames: error: (B, 3) estimate minus truth, m along and left of the true heading, rad; nees: (B, 3) squared
-    error by variance, of the same axes, and total: (B,) of all three; NaN without a covariance, infinite where one has
-    no width. found: (B,) bool."""
+    """Of B frames: error: (B, 3) estimate minus truth, m along and left of the true heading, rad; found: (B,) bool."""
 
     error: Tensor
-    nees: Tensor
-    total: Tensor
     found: Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LevelErrors:
+    """What the L levels of N frames are off, in (m, m, rad) along body axes at each level's centre.
+
+    error: (N, L, 3) truth minus the estimate composed up to the level; cov: (N, L, 3, 3) as the level's histogram has
+    it, infinite on its diagonal without landmarks; inside: (N, L) bool, the truth lies within the level's window; yaw:
+    (N, L) of the centres in the initial pose's axes, rad.
+    """
+
+    error: Floats
+    cov: Floats
+    inside: NDArray[np.bool_]
+    yaw: Floats
 
 
 @torch.no_grad()
 def judged(estimate: PoseEstimate | RegressedPose, truth: Tensor) -> Judged:
-    """truth: (B, 3) T_init^-1 T_true. The covariance is the last level's, turned from its centre's axes to the truth's.
-
-    A frame without landmarks has an infinite covariance, so that its NEES is NaN: it states nothing.
-    """
-    truth = truth.to(estimate.offset)
-    error = between(truth, estimate.offset)
-    unknown = torch.full_like(error, torch.nan)
-    if isinstance(estimate, RegressedPose):
-        return Judged(error, unknown, unknown[:, 0], estimate.found)
-    last = estimate.levels[-1]
-    cov = _turned(last.cov, last.centre[:, 2] - truth[:, 2])
-    known = torch.isfinite(cov).flatten(1).all(1)
-    safe = torch.where(known[:, None, None], cov, torch.eye(3).to(cov))
-    nees = error.square() / safe.diagonal(dim1=1, dim2=2)
-    root, failed = torch.linalg.cholesky_ex(safe.double())
-    root = torch.where((failed == 0)[:, None, None], root, torch.eye(3, dtype=torch.float64))
-    white = torch.linalg.solve_triangular(root, error.double()[..., None], upper=False)
-    total = torch.where(failed == 0, white.square().sum((1, 2)).to(error), torch.full_like(error[:, 0], torch.inf))
-    return Judged(
-        error,
-        torch.where(known[:, None], nees, unknown),
-        torch.where(known, total, unknown[:, 0]),
-        estimate.found,
-    )
+    """truth: (B, 3) T_init^-1 T_true."""
+    return Judged(between(truth.to(estimate.offset), estimate.offset), estimate.found)
 
 
-def _turned(cov: Tensor, angle: Tensor) -> Tensor:
-    """Covariances (B, 3, 3) seen from axes in which theirs are turned to the left by an angle (B,), rad."""
-    columns = torch.eye(2).to(cov).expand(len(cov), 2, 2)
-    R = torch.eye(3).to(cov).repeat(len(cov), 1, 1)
-    R[:, :2, :2] = rotated(columns, angle[:, None]).transpose(1, 2)
-    return R @ cov @ R.transpose(1, 2)
+@torch.no_grad()
+def level_errors(estimate: PoseEstimate, truth: Tensor, lattice: LatticeConfig) -> LevelErrors:
+    """truth: (B, 3) T_init^-1 T_true. A truth beyond a window's outermost candidates is none that its mean can reach,
+    and what the level is off says nothing of its covariance."""
+    errors, covs, inside, yaws = [], [], [], []
+    for number, level in enumerate(estimate.levels):
+        there = between(level.centre.double(), truth.double())
+        errors.append(there - level.mean.double())
+        covs.append(level.cov.double())
+        inside.append(in_window(lattice, number, there))
+        yaws.append(level.centre[:, 2].double())
+    return LevelErrors(*(torch.stack(each, 1).cpu().numpy() for each in (errors, covs, inside, yaws)))
+
+
+def joined(several: list[LevelErrors]) -> LevelErrors:
+    """One after the other."""
+    names = ("error", "cov", "inside", "yaw")
+    return LevelErrors(*(np.concatenate([getattr(each, name) for each in several]) for name in names))

@@ -1,7 +1,7 @@
 """Samples from made-up worlds: a vehicle on a street, one turn of its LiDAR, and what a map knows of the place.
 
-Worlds of training and of evaluation have streets of different seeds, and never meet. A sample depends on its recipe,
-split and number alone.
+Worlds of training, of calibration and of evaluation have streets of different seeds, and never meet. A sample depends
+on its recipe, split and number alone.
 """
 
 import hashlib
@@ -27,11 +27,11 @@ from sensors.simulate.world import BODY_M, World
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
-Split = Literal["train", "held-out"]
+Split = Literal["train", "held-out", "calibration"]
 
 START_LLH = (0.6945, 2.0333, 40.0)
 """Where all made-up worlds lie, rad, rad, m."""
-FIRST_SEED: dict[Split, int] = {"train": 0, "held-out": 1_000_000}
+FIRST_SEED: dict[Split, int] = {"train": 0, "held-out": 1_000_000, "calibration": 2_000_000}
 """Seed of the streets of a split's first world."""
 FORMAT = 1
 """Rises whenever the same recipe would give other samples."""
@@ -45,7 +45,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     samples: Annotated[int, msgspec.Meta(ge=1)] = 2000
     """Of training; they come again each epoch, from other initial poses."""
     worlds: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 16
-    """Made-up cities of training, and as many of evaluation."""
+    """Made-up cities of training, and as many of each other split."""
     road_km: Annotated[float, msgspec.Meta(ge=20.0, le=1000.0)] = 20.0
     """Streets of each, km."""
     reach_m: Annotated[float, msgspec.Meta(ge=10.0, le=64.0)] = 44.0

@@ -120,6 +120,7 @@ def answer_of(estimate: PoseEstimate, T_map_init: Floats, T_body_lifted: Floats,
     T_map_lifted, T_lifted_body = T_map_init @ T_body_lifted, np.linalg.inv(T_body_lifted)
     T = [T_map_lifted @ planar(offset) @ T_lifted_body for offset in offsets]
     weights = _array(estimate.weights[0])
+    weights = weights / max(weights.sum(), 1.0)  # float32
     modes = np.where(weights[:, None] > 0.0, [planar_of(mode) for mode in T[1:]], np.nan)
     raw = np.stack([_array(level.cov[0]) for level in estimate.levels])
     levels = raw

@@ -15,11 +15,9 @@ from torch import Tensor, nn
 
 from egovm.config import LatticeConfig
 from egovm.lattice import PAPER, candidates, compose, seen_from
+from egovm.solver_dots import chunks
 from egovm.solver_modes import two_modes
 from egovm.solver_window import Window, dot_window, dots_at, lattice_dots, summed_lattice_dots
-
-_CHUNK = 64
-"""Elements whose groups of dots go through h at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,8 +144,8 @@ class PoseSolver(nn.Module):
         if self.groups == 1:
             return self._factor(window)[:, None, None, None] * summed_lattice_dots(window)
         total = torch.zeros((), dtype=window.dots.dtype, device=window.dots.device)
-        for start in range(0, window.valid.shape[1], _CHUNK):
-            part = _elements(window, slice(start, start + _CHUNK))
+        for chosen in chunks(window.valid.shape[1]):
+            part = _elements(window, chosen)
             alike = self.similarity[window.level](lattice_dots(part).movedim(2, -1))
             total = total + torch.where(part.valid[:, :, None, None, None], alike, torch.zeros_like(alike)).sum(1)
         return self._factor(window)[:, None, None, None] * total

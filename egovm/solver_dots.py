@@ -21,7 +21,7 @@ def patch_dots(
     features: (B, H, W, C), best contiguous so; embeddings: (B, N, C) float32 or float64; corners: (B, N, 2) int64, such
     that the patch lies on the map; valid: (B, N) bool, points for which there is nothing to do have zeros.
     """
-    if torch.compiler.is_exporting() or torch.onnx.is_in_onnx_export():
+    if exporting():
         return gathered_dots(features, embeddings, corners, valid, size, groups)
     found: Tensor = _patch_dots(features, embeddings, corners, valid, size, groups)
     return found
@@ -33,7 +33,7 @@ def gathered_dots(
     """The same in plain torch, on any device."""
     parts = [
         _dots_of(_gathered(features, corners[:, s], size, embeddings.dtype), embeddings[:, s], groups)
-        for s in _chunks(corners.shape[1])
+        for s in chunks(corners.shape[1])
     ]
     dots = torch.unflatten(torch.cat(parts, 1), -1, (size, size))
     return torch.where(valid[:, :, None, None, None], dots, torch.zeros((), dtype=dots.dtype, device=dots.device))
@@ -111,7 +111,15 @@ def _split(channels: Tensor, groups: int) -> Tensor:
     return torch.unflatten(channels, -1, (groups, channels.shape[-1] // groups))
 
 
-def _chunks(points: int) -> list[slice]:
+def exporting() -> bool:
+    """Whether a graph is being made for elsewhere."""
+    return torch.compiler.is_exporting() or torch.onnx.is_in_onnx_export()
+
+
+def chunks(points: int) -> list[slice]:
+    """Parts of so many points or elements that go through memory at once; in exports all, for their number is open."""
+    if exporting():
+        return [slice(None)]
     return [slice(s, min(s + _CHUNK, points)) for s in range(0, max(points, 1), _CHUNK)]
 
 
@@ -141,7 +149,7 @@ def _add_gathered(
     """Add the gradients, some points at a time."""
     size, groups = gradient.shape[-1], gradient.shape[2]
     channels = features.shape[3]
-    for s in _chunks(corners.shape[1]):
+    for s in chunks(corners.shape[1]):
         given = gradient[:, s].flatten(3)
         patches = _split(_gathered(features, corners[:, s], size, embeddings.dtype), groups)
         of_embeddings[:, s] = torch.einsum("bngs,bnsgc->bngc", given, patches).flatten(2)

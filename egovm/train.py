@@ -129,7 +129,7 @@ def _run(training: Training, folder: Path, cache: Path, tell: Callable[[Entry], 
     config = training.config
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
     batches = TrainingBatches(
-        config.recipe, config.built(), config.noise, config.batch, config.turn_deg, config.seed, cache
+        config.recipe, config.built(), config.noise, config.augmentation, config.batch, config.seed, cache
     )
     saved = clock = time.monotonic()
     with (folder / LOG).open("a") as log:

@@ -7,7 +7,7 @@ import msgspec
 
 from egovm.config import ABLATIONS, PRESETS, NetworkConfig
 from egovm.config_file import read_toml
-from egovm.dataset import InitialNoise
+from egovm.dataset import Augmentation, InitialNoise
 from egovm.losses import LossConfig
 from egovm.made_samples import Recipe
 from sensors.errors import EgolocError
@@ -35,8 +35,6 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The image backbone learns so much slower."""
     clip: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
     """Largest norm of a step's gradient."""
-    turn_deg: Annotated[float, msgspec.Meta(ge=0.0, le=180.0)] = 10.0
-    """Augmentation: body axes are turned by up to so much, deg."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
     threads: Annotated[int, msgspec.Meta(ge=0)] = 0
     """Of the processor; 0: as many as there are cores."""
@@ -45,6 +43,7 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     checkpoint_s: Annotated[float, msgspec.Meta(gt=0.0)] = 30.0
     """Time between checkpoints, s: what a kill may lose."""
     noise: InitialNoise = InitialNoise()
+    augmentation: Augmentation = Augmentation()
     loss: LossConfig = LossConfig()
     recipe: Recipe = Recipe()
 

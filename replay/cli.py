@@ -12,6 +12,7 @@ import tyro
 from replay.commands.benchmarks import BENCHMARKS
 from replay.commands.comparing import Compare, Score
 from replay.commands.demo import Demo
+from replay.commands.exporting import Export
 from replay.commands.frames import Frames
 from replay.commands.logs import Convert, Info, Simulate
 from replay.commands.looking import View
@@ -19,6 +20,7 @@ from replay.commands.map_check import CheckMap
 from replay.commands.map_files import ExportMap, ImportMap
 from replay.commands.mapping import MapInfo
 from replay.commands.noise import Allan, Noise
+from replay.commands.predicting import Predict
 from replay.commands.replaying import Replay
 from replay.commands.surveying import Align, Surfels
 from replay.commands.training import Evaluate, Train
@@ -38,6 +40,8 @@ COMMANDS = {
     "noise": Noise,
     "train": Train,
     "eval": Evaluate,
+    "predict": Predict,
+    "export": Export,
 }
 MAPS = {
     "import": ImportMap,

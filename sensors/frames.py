@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sensors._motion_kernels import transform
 from sensors.errors import EgolocError
 from sensors.images import Image
 from sensors.rotation import check_rigid
@@ -49,8 +50,9 @@ class Sweep:
 
     def in_body(self) -> Floats:
         """(N, 3) m, points in body axes, each at the moment at which it was measured (or was brought to)."""
-        T = self.T_body_lidar
-        return self.xyz.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        out = np.empty(self.xyz.shape)
+        transform(self.xyz, self.T_body_lidar, out)
+        return out
 
     def _column(self, name: str, shape: tuple[int, ...], dtype: Any, default: float) -> NDArray[Any]:
         given = getattr(self, name)

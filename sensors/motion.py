@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sensors._motion_kernels import carry
 from sensors.clock import NS_PER_S
 from sensors.frames import Frame, Sweep
 from sensors.maps.accumulation import Accumulation, accumulation
@@ -51,19 +52,12 @@ class ConstantVelocity:
         return True
 
     def carried(self, p_body: Floats, t_ns: ArrayLike, to_ns: int) -> Floats:
-        """The exponential of the twist (Rodrigues) over the time from to_ns to t_ns."""
-        dt = ((np.asarray(t_ns, np.int64) - to_ns) / NS_PER_S)[..., None]
-        v, rate = np.asarray(self.velocity), float(np.linalg.norm(self.turn_rate))
-        if rate < 1e-9:
-            return p_body + v * dt
-        axis = np.asarray(self.turn_rate) / rate
-        angle = rate * dt
-        sin, rest = np.sin(angle), 1.0 - np.cos(angle)
-        along = axis * (p_body @ axis)[..., None]
-        turned = p_body + sin * np.cross(axis, p_body) + rest * (along - p_body)
-        straight = axis * (axis @ v)
-        moved: Floats = (sin * (v - straight) + rest * np.cross(axis, v)) / rate + straight * dt
-        return turned + moved
+        """The exponential of the twist over the time from to_ns to t_ns."""
+        p = np.ascontiguousarray(p_body, np.float64)
+        dt = np.ascontiguousarray(np.broadcast_to((np.asarray(t_ns, np.int64) - to_ns) / NS_PER_S, len(p)))
+        out = np.empty_like(p)
+        carry(p, dt, np.array(self.velocity, np.float64), np.array(self.turn_rate, np.float64), out)
+        return out
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """egoloc train and eval: weights of EgoVM, and what they are worth."""
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,6 +14,9 @@ from replay.commands.output import print_json, stage
 from sensors.errors import EgolocError
 
 if TYPE_CHECKING:
+    from egovm.dataset import EvaluationBatches
+    from egovm.made_samples import Split
+    from egovm.network import EgoVM
     from egovm.train_config import TrainConfig
 
 SAMPLES = Path("runs/samples")
@@ -81,7 +85,9 @@ class Train:
 class Evaluate:
     """Judge weights on worlds that no training has seen: errors along, across and in yaw, and of its covariance.
 
-    The row of the initial pose is what doing nothing would give.
+    The row of the initial pose is what doing nothing would give. With --calibrate, covariances are first fitted to the
+    errors on worlds that are neither trained nor judged on. The fit is kept in NAME-calibration.toml beside the
+    weights; poses stay as they are.
     """
 
     weights: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WEIGHTS")]
@@ -90,6 +96,10 @@ class Evaluate:
     """Of initial poses: +-2.5 m and deg; +-3; normal of 1.5 m, 0.75 m, 0.85 deg."""
     frames: Annotated[int, tyro.conf.arg(metavar="N")] = 500
     """How many frames."""
+    calibrate: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: none)")] = None
+    """Fit a calibration to so many frames, 800 say, with noise uniform and gauss and all kinds of --map in turns."""
+    map: Literal["full", "no-surfels", "lines", "thinned"] = "full"
+    """What there is of the map: all; no surfels; neither surfels nor poles and signs; a share of all, by frame."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Of the noise of initial poses."""
     samples: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = SAMPLES
@@ -99,9 +109,10 @@ class Evaluate:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Run all frames and print the table."""
-        from egovm.dataset import NOISES, EvaluationBatches
+        import msgspec
+
+        from egovm.calibration import read_calibration
         from egovm.evaluate import evaluate
-        from egovm.made_samples import Recipe
         from egovm.network import EgoVM
         from egovm.weights import load_weights, read_config, weights_path
         from replay.egovm_table import evaluation_table
@@ -115,16 +126,42 @@ class Evaluate:
         load_weights(network, path)
         if config.lidar is None:
             raise EgolocError(f"{path}: expected a network with a lidar: made-up worlds have no images yet")
-        batches = EvaluationBatches(
-            Recipe(), config, NOISES[self.noise], self.frames, seed=self.seed, cache=self.samples
-        )
+        if self.calibrate is not None:
+            self._calibrate(network, path)
+        calibration = read_calibration(path, config.solver.lattice)
         with stage(f"{self.frames} frames") as say:
-            report = evaluate(network, batches, tell=lambda done: say(f"{done}"))
-        report = {"weights": str(self.weights), "noise": self.noise, **report}
+            batches = self._batches(network, self.frames, "held-out")
+            report = evaluate(network, batches, calibration, tell=lambda done: say(f"{done}"))
+        fit = None if calibration.fit is None else msgspec.to_builtins(calibration.fit)
+        report = {"weights": str(self.weights), "noise": self.noise, "map": self.map, "calibration": fit, **report}
         if self.json:
             print_json(report)
         else:
             output_console().print(evaluation_table(report))
+
+    def _calibrate(self, network: "EgoVM", path: Path) -> None:
+        """Fit a calibration and write it beside the weights."""
+        from egovm.calibration import calibration_path, write_calibration
+        from egovm.calibration_fit import FEWEST
+        from egovm.evaluate import calibrate
+
+        assert self.calibrate is not None
+        if self.calibrate < FEWEST:
+            raise EgolocError(f"--calibrate: expected {FEWEST} frames or more, got {self.calibrate}")
+        if not os.access(path.parent, os.W_OK):  # before minutes of work
+            raise EgolocError(f"{calibration_path(path)}: cannot be written: the folder may not be written to")
+        with stage(f"{self.calibrate} frames of the calibration") as say:
+            batches = self._batches(network, self.calibrate, "calibration")
+            calibration = calibrate(network, batches, tell=lambda done: say(f"{done}"))
+        print(f"Calibration: {write_calibration(calibration, path)}", file=sys.stderr)
+
+    def _batches(self, network: "EgoVM", count: int, split: "Split") -> "EvaluationBatches":
+        from egovm.dataset import NOISES, EvaluationBatches
+        from egovm.made_samples import Recipe
+
+        return EvaluationBatches(
+            Recipe(), network.config, NOISES[self.noise], count, split, self.seed, self.samples, self.map
+        )
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from egovm.config import BevConfig, FusionConfig, LidarConfig, MatchingConfig, NetworkConfig
+from egovm.dataset import Augmentation
 from egovm.losses import LossConfig
 from egovm.made_samples import Recipe
 from egovm.train_config import TrainConfig
@@ -26,12 +27,16 @@ TRAINING = TrainConfig(
     steps=6,
     learning_rate=5e-3,
     warm_up=2,
-    turn_deg=5.0,
     threads=1,
     workers=0,
     loss=LossConfig(samples=64),
     recipe=RECIPE,
+    augmentation=Augmentation(turn_deg=5.0),
 )
+
+
+STILL = Augmentation(turn_deg=0.0, drop_surfels=0.0, drop_kinds=0.0)
+"""Samples as they are."""
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """Batches: whoever knows the truth finds the offset; noise, turns and batches are as said and of their seed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +11,28 @@ from egovm.batch import SURFEL, TYPES, Truth
 from egovm.config import PRESETS, Ablation
 from egovm.dataset import (
     NOISES,
+    Augmentation,
     EvaluationBatches,
     InitialNoise,
     TrainingBatches,
     batched,
     planar,
     seen_from_off,
+    thinned,
     turned,
 )
+from egovm.evaluate import InTurns
 from egovm.judging import judged
 from egovm.lattice import seen_from
 from egovm.losses import LossConfig, network_losses
 from egovm.made_samples import made_sample
-from egovm.map_elements import places_of
+from egovm.map_contents import CONTENTS, MapContent
+from egovm.map_elements import Pieces, places_of
 from egovm.pose_solver import PoseSolver
 from egovm.sample import Sample
 from sensors.maps.vector_map import NO_SURFELS, Kind
 from tests.egovm.made_map import made
-from tests.egovm.made_training import NETWORK, RECIPE, made_cache
+from tests.egovm.made_training import NETWORK, RECIPE, STILL, made_cache
 
 __all__ = ["made_cache"]
 
@@ -125,7 +130,7 @@ def test_noise_is_as_wide_as_said(name: str) -> None:
 
 
 def training(cache: Path, seed: int = 0) -> TrainingBatches:
-    return TrainingBatches(RECIPE, NETWORK, InitialNoise(), 2, 5.0, seed, cache)
+    return TrainingBatches(RECIPE, NETWORK, InitialNoise(), Augmentation(turn_deg=5.0), 2, seed, cache)
 
 
 def test_batches_are_of_the_seed_and_the_step(made_cache: Path) -> None:
@@ -144,6 +149,20 @@ def test_every_sample_comes_once_an_epoch(made_cache: Path) -> None:
     sizes = [sorted(_sizes(training(made_cache), steps)) for steps in ((0, 1), (2, 3))]
     assert sizes[0] == sizes[1]
     assert len(set(sizes[0])) == RECIPE.samples
+
+
+def test_some_maps_lack_surfels_or_a_kind_but_never_all() -> None:
+    types = np.repeat(np.arange(TYPES), 2)
+    rows = len(types)
+    zeros = np.zeros((rows, 2, 3), np.float32), np.zeros(rows, np.float32), np.zeros((rows, 3), np.float32)
+    pieces = Pieces(types, *zeros, np.zeros((rows, 2), np.float32))
+    rng = np.random.default_rng(2)
+    found = [set(thinned(pieces, Augmentation(drop_surfels=0.5, drop_kinds=0.2), rng).type) for _ in range(400)]
+    share = [np.mean([kind not in one for one in found]) for kind in range(TYPES)]
+    assert share[SURFEL] == pytest.approx(0.5, abs=0.1)
+    assert share[:SURFEL] == pytest.approx([0.2] * SURFEL, abs=0.08)
+    assert len(thinned(pieces, Augmentation(drop_surfels=1.0, drop_kinds=1.0), rng)) == rows
+    assert len(thinned(pieces, STILL, rng)) == rows
 
 
 def _sizes(batches: TrainingBatches, steps: tuple[int, ...]) -> list[int]:
@@ -166,3 +185,31 @@ def test_frames_of_evaluation_are_neither_turned_nor_those_of_training(made_cach
     np.testing.assert_allclose(batch.points.xyz.numpy(), expected, atol=0.0011)
     with pytest.raises(IndexError):
         batches[3]
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+def test_a_poorer_map_leaves_the_initial_pose_and_the_points(content: MapContent, made_cache: Path) -> None:
+    full = EvaluationBatches(RECIPE, NETWORK, NOISES["gauss"], 3, cache=made_cache)
+    batch, truth = replace(full, content=content)[1]
+    again, _ = replace(full, content=content)[1]
+    expected, offset = full[1]
+    assert torch.equal(truth.offset, offset.offset)
+    assert batch.points is not None
+    assert expected.points is not None
+    assert torch.equal(batch.points.xyz, expected.points.xyz)
+    assert torch.equal(batch.elements.ends, again.elements.ends)
+    fewer = int(batch.elements.valid.sum()) < int(expected.elements.valid.sum())
+    assert fewer == (content != "full")
+
+
+def test_calibrations_take_turns_in_every_world(made_cache: Path) -> None:
+    """Noise and map change from frame to frame, and each pair of them meets every world."""
+    base = EvaluationBatches(RECIPE, NETWORK, NOISES["uniform"], 30, "calibration", cache=made_cache)
+    several = tuple(replace(base, noise=InitialNoise(lon_m=lon, lat_m=0.0, yaw_deg=0.0)) for lon in (0.5, 1.0, 2.0))
+    turns = InTurns(several)
+    assert len(turns) == 30
+
+    met = {(number % RECIPE.worlds, turns.turn(number)) for number in range(30)}
+    assert met == {(world, turn) for world in range(RECIPE.worlds) for turn in range(3)}
+    for number in (0, 1, 2):
+        assert torch.equal(turns[number][1].offset, several[turns.turn(number)][number][1].offset)

@@ -39,7 +39,7 @@ def test_points_are_in_body_axes_within_the_plane() -> None:
         intensity=[0.0, 51.0, 1.0, np.nan, 1.0],
         offset_ns=[0, 1_000_000, 0, 0, 0],
     )
-    points, images = frame_inputs([Frame(T0, T0, (seen,))], LIDAR_ONLY)
+    points, images, _ = frame_inputs([Frame(T0, T0, (seen,))], LIDAR_ONLY)
     assert images is None
     assert points is not None
     np.testing.assert_allclose(points.xyz, [[1, 2, 1], [edge - 0.1, 0, 1], [0, 0, 4.9]], rtol=1e-6)
@@ -52,10 +52,10 @@ def test_points_are_brought_to_the_frames_time() -> None:
     """At 10 m/s a thing that stands was 0.5 m nearer 50 ms later; compensated points stay."""
     seen = sweep([[3, 0, 0], [2.5, 0, 0]], offset_ns=[0, 50_000_000])
     moved = ConstantVelocity((10.0, 0.0, 0.0))
-    points, _ = frame_inputs([Frame(T0, T0, (seen,))], LIDAR_ONLY, [moved])
+    points, _, _ = frame_inputs([Frame(T0, T0, (seen,))], LIDAR_ONLY, [moved])
     assert points is not None
     np.testing.assert_allclose(points.xyz, [[3, 0, 1], [3, 0, 1]], atol=1e-6)
-    points, _ = frame_inputs([Frame(T0, T0, (replace(seen, compensated=True),))], LIDAR_ONLY, [moved])
+    points, _, _ = frame_inputs([Frame(T0, T0, (replace(seen, compensated=True),))], LIDAR_ONLY, [moved])
     assert points is not None
     np.testing.assert_allclose(points.xyz[:, 0], [3.0, 2.5], atol=1e-6)
 
@@ -65,7 +65,7 @@ def test_frames_make_a_batch() -> None:
     first = Frame(T0, T0, (sweep([[1, 0, 0]]), sweep([[2, 0, 0]])), (image(T0, "a"), image(T0, "b")))
     second = Frame(T0, T0, (), (image(T0, "c"),))
     third = Frame(T0, T0, (sweep([[3, 0, 0]]),))
-    points, images = frame_inputs([first, second, third], TINY)
+    points, images, _ = frame_inputs([first, second, third], TINY)
     assert points is not None
     assert images is not None
     assert (points.frames, points.frame.tolist(), points.xyz[:, 0].tolist()) == (3, [0, 0, 2], [1.0, 2.0, 3.0])
@@ -146,7 +146,7 @@ def bev(config: NetworkConfig, found: list[Frame], *motions: object) -> tuple[to
     torch.manual_seed(0)
     network = BevNetwork(config).eval()
     with torch.no_grad():
-        maps: tuple[torch.Tensor, ...] = network(*frame_inputs(found, config, list(motions) or None))  # type: ignore[arg-type]
+        maps: tuple[torch.Tensor, ...] = network(*frame_inputs(found, config, list(motions) or None)[:2])  # type: ignore[arg-type]
     return maps
 
 
@@ -175,3 +175,20 @@ def test_an_argoverse_sweep_runs_through_the_network(data: Path) -> None:
     assert [len(level) for level in maps] == [2, 2, 2]
     assert all(level.isfinite().all() for level in maps)
     assert (maps[0][0] - maps[0][1]).abs().max() > 1e-3
+
+
+def test_bodies_that_ride_higher_are_lifted_to_the_ground_of_the_network() -> None:
+    """Told, or seen in the points; images see the lifted axes from as much higher."""
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(-11.0, 11.0, (4000, 2))
+    seen = Frame(T0, T0, (sweep(np.column_stack((xy, rng.normal(-2.7, 0.02, len(xy))))),), (image(T0, "a"),))
+    told, looked = frame_inputs([seen], TINY, ground_m=-1.7), frame_inputs([seen], TINY)
+    ground = TINY.bev.ground_m
+    assert told.lifts == (ground + 1.7,)
+    assert looked.lifts == pytest.approx((ground + 1.7,), abs=2e-3)
+    assert told.points is not None
+    assert told.images is not None
+    assert float(told.points.xyz[:, 2].mean()) == pytest.approx(ground, abs=1e-3)
+    body = np.array(((6.0, 1.0, -0.4, 1.0),)).T
+    lifted = body + np.array(((0.0,), (0.0,), (ground + 1.7,), (0.0,)))
+    assert np.allclose(told.images.T_camera_body[0, 0].numpy() @ lifted, seen.images[0].T_camera_body @ body, atol=1e-5)

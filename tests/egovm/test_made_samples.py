@@ -1,12 +1,14 @@
 """Made samples: of their seed, true to the map, and never the same places in training and evaluation."""
 
+from itertools import combinations, pairwise
 from pathlib import Path
+from typing import get_args
 
 import msgspec
 import numpy as np
 import pytest
 
-from egovm.made_samples import Motion, made_sample, recipe_name, sample_of
+from egovm.made_samples import FIRST_SEED, Motion, Recipe, Split, made_sample, recipe_name, sample_of
 from egovm.sample import Sample
 from sensors.maps.vector_map import Kind
 from tests.egovm.made_training import RECIPE
@@ -30,6 +32,17 @@ def test_a_sample_depends_on_its_recipe_split_and_number_alone(sample: Sample) -
     assert same(sample, made_sample(RECIPE, "train", 2))
     assert not same(sample, made_sample(RECIPE, "train", 4))
     assert not np.allclose(sample.T_map_body, made_sample(RECIPE, "held-out", 2).T_map_body)
+
+
+def test_worlds_of_the_splits_never_meet() -> None:
+    """Seeds of as many worlds as a recipe may have."""
+    most = msgspec.inspect.type_info(Recipe).fields[1].type.le  # type: ignore[attr-defined]
+    assert most == 100_000
+    assert set(FIRST_SEED) == set(get_args(Split)) == {"train", "held-out", "calibration"}
+    first = sorted(FIRST_SEED.values())
+    assert all(b - a >= most for a, b in pairwise(first))
+    places = [made_sample(RECIPE, split, 2).T_map_body[:2, 3] for split in get_args(Split)]
+    assert min(np.linalg.norm(a - b) for a, b in combinations(places, 2)) > 1.0
 
 
 def test_points_stand_where_the_map_says(sample: Sample) -> None:

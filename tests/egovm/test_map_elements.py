@@ -62,8 +62,11 @@ def test_points_have_heights_of_their_own() -> None:
     assert not found.height[~points].any()
 
 
-def test_walls_face_the_vehicle_and_the_ground_faces_up() -> None:
-    surfels = patches(np.array([(10, 0), (0, -8), (5, 5)]), np.array([(1, 0, 0), (0, -0.8, 0.6), (0.6, 0, 0.8)]))
+def test_walls_face_the_vehicle_slopes_up_and_level_ground_is_left_out() -> None:
+    surfels = patches(
+        np.array([(10, 0), (0, -8), (5, 5), (1, 2)]),
+        np.array([(1, 0, 0), (0, -0.8, 0.6), (0.6, 0, 0.8), (0.1, 0, 0.99498744)]),
+    )
     found = around(NO_ELEMENTS, surfels, yaw=0.0)
     assert found.type.tolist() == [SURFEL] * 3
     assert np.allclose(found.ends[:, 0], [(5, 5, 3.8), (0, -8, 3.8), (10, 0, 3.8)])
@@ -76,7 +79,7 @@ def test_walls_face_the_vehicle_and_the_ground_faces_up() -> None:
 
 def test_without_surfels_there_are_none() -> None:
     a1 = msgspec.structs.replace(PAPER, ablation=Ablation(surfels=False))
-    assert len(around(NO_ELEMENTS, patches(np.ones((3, 2)), np.tile((0.0, 0.0, 1.0), (3, 1))), a1)) == 0
+    assert len(around(NO_ELEMENTS, patches(np.ones((3, 2)), np.tile((1.0, 0.0, 0.0), (3, 1))), a1)) == 0
 
 
 def test_what_lies_outside_is_cut_off() -> None:
@@ -91,7 +94,7 @@ def test_what_lies_outside_is_cut_off() -> None:
             (Kind.ROAD_BOUNDARY, [(-90, -36), (90, -36)]),
             (Kind.POLE, [(0, half + 0.1)]),
         ),
-        patches(np.array([(0, -half - 0.1), (0, 49)]), np.tile((0.0, 0.0, 1.0), (2, 1))),
+        patches(np.array([(0, -half - 0.1), (0, 49)]), np.tile((1.0, 0.0, 0.0), (2, 1))),
     )
     assert found.type.tolist() == [Kind.LANE_LINE] * 2
     assert found.ends[-1, 1, 0] == pytest.approx(half, abs=1e-5)
@@ -114,7 +117,7 @@ def test_the_solver_uses_every_piece_that_is_left() -> None:
 
 def test_the_nearest_are_kept_surfels_within_their_share_and_the_rest_counted(caplog: pytest.LogCaptureFixture) -> None:
     lines = made(*((Kind.STOP_LINE, [(x, -1), (x, 1)]) for x in range(1, 9)))
-    near = patches(np.column_stack((np.linspace(0.1, 0.9, 9), np.zeros(9))), np.tile((0.0, 0.0, 1.0), (9, 1)))
+    near = patches(np.column_stack((np.linspace(0.1, 0.9, 9), np.zeros(9))), np.tile((1.0, 0.0, 0.0), (9, 1)))
     config = msgspec.structs.replace(PAPER, matching=MatchingConfig(most_elements=8))
     with caplog.at_level(logging.INFO):
         found = around(lines, near, config)

@@ -13,7 +13,7 @@ from egovm.network import EgoVM
 from egovm.pose_solver import PoseEstimate
 from egovm.regression_solver import RegressedPose
 from egovm.train import begun, learn
-from tests.egovm.made_training import NETWORK, RECIPE, TRAINING, made_cache
+from tests.egovm.made_training import NETWORK, RECIPE, STILL, TRAINING, made_cache
 from tests.egovm.scenes import no_points
 
 __all__ = ["made_cache"]
@@ -21,7 +21,7 @@ __all__ = ["made_cache"]
 
 @pytest.fixture(scope="module")
 def seen(made_cache: Path) -> tuple[Batch, Truth]:
-    return TrainingBatches(RECIPE, NETWORK, InitialNoise(), 2, 0.0, 0, made_cache)[0]
+    return TrainingBatches(RECIPE, NETWORK, InitialNoise(), STILL, 2, 0, made_cache)[0]
 
 
 def network(config: NetworkConfig = NETWORK) -> EgoVM:
@@ -63,7 +63,7 @@ def test_every_ablation_learns_for_a_step(name: str, made_cache: Path) -> None:
     """All weights that the switches leave get a gradient, and the losses that they leave out are zero."""
     config = msgspec.structs.replace(TRAINING, ablation=name)
     training = begun(config)
-    batch, truth = TrainingBatches(RECIPE, config.built(), InitialNoise(), 2, 0.0, 0, made_cache)[0]
+    batch, truth = TrainingBatches(RECIPE, config.built(), InitialNoise(), STILL, 2, 0, made_cache)[0]
     assert isinstance(training.network(batch).estimate, RegressedPose if name == "A6" else PoseEstimate)
     before = {key: value.clone() for key, value in training.network.named_parameters()}
     entry = learn(training, batch, truth)

@@ -20,7 +20,7 @@ from egovm.train import CHECKPOINT, LOG, WEIGHTS, Entry, begun, checkpoint, lear
 from egovm.train_config import TRAININGS, TrainConfig, read_training
 from egovm.weights import load_weights, read_config
 from sensors.errors import EgolocError
-from tests.egovm.made_training import NETWORK, RECIPE, TRAINING, made_cache
+from tests.egovm.made_training import NETWORK, RECIPE, STILL, TRAINING, made_cache
 
 __all__ = ["made_cache"]
 
@@ -35,7 +35,7 @@ def test_one_batch_is_learned(made_cache: Path) -> None:
     """From errors of a metre to centimetres, and to a loss that no wide posterior has."""
     config = msgspec.structs.replace(TRAINING, steps=40)
     training = begun(config)
-    batches = TrainingBatches(RECIPE, NETWORK, config.noise, 2, 0.0, 0, made_cache)
+    batches = TrainingBatches(RECIPE, NETWORK, config.noise, STILL, 2, 0, made_cache)
     batch, truth = batches[0]
     entries = [learn(training, batch, truth) for _ in range(40)]
     first, last = entries[0], entries[-5:]
@@ -116,7 +116,7 @@ def test_weights_are_those_of_the_network(tmp_path: Path, made_cache: Path) -> N
 def test_a_step_without_a_finite_gradient_changes_nothing(made_cache: Path) -> None:
     training = begun(TRAINING)
     assert training.network.solver is not None
-    batch, truth = TrainingBatches(RECIPE, NETWORK, TRAINING.noise, 2, 0.0, 0, made_cache)[0]
+    batch, truth = TrainingBatches(RECIPE, NETWORK, TRAINING.noise, STILL, 2, 0, made_cache)[0]
     weights = {name: value.detach().clone() for name, value in training.network.named_parameters()}
     hook = training.network.solver.tau.register_hook(lambda gradient: gradient * math.inf)
     entry = learn(training, batch, truth)

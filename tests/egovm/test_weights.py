@@ -8,9 +8,10 @@ import torch
 from safetensors.torch import save_file
 
 from egovm.bev_network import BevNetwork
+from egovm.calibration import read_calibration
 from egovm.config import PAPER, SMALL, CameraConfig, NetworkConfig
 from egovm.timm_models import backbone
-from egovm.weights import config_toml, load_weights, read_config, save_weights
+from egovm.weights import config_toml, load_weights, read_config, save_weights, weights_path
 from sensors.errors import EgolocError
 from tests.egovm.scenes import TINY, images
 
@@ -83,3 +84,12 @@ def test_backbones_that_do_not_fit(tmp_path: Path) -> None:
     with pytest.raises(EgolocError, match=r"w\.safetensors: expected weights of mobilenetv3_small_050, .* is missing"):
         backbone("mobilenetv3_small_050", tmp_path / "w.safetensors")
     assert CameraConfig().backbone == "ese_vovnet39b"
+
+
+def test_weights_that_come_with_egoloc_have_their_calibration() -> None:
+    """Trained anew, they need another: egoloc eval small-lidar --calibrate 800."""
+    path = weights_path("small-lidar")
+    calibration = read_calibration(path, read_config(path).solver.lattice)
+    assert calibration.fit is not None
+    assert calibration.fit.frames >= 400
+    assert all(a < b for a, b in zip(calibration.fit.nll_after, calibration.fit.nll_before, strict=True))

@@ -1,0 +1,241 @@
+"""EgoVM along a log: each frame is matched against the map, and the log goes on with the fixes that were found."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovm.infer import Matcher
+from egovm.match import Match
+from replay.config import RunConfig
+from replay.initial_poses import InitialPoses, KnownPoses, initial_poses
+from sensors.clock import NS_PER_S
+from sensors.errors import EgolocError
+from sensors.frames import Frame
+from sensors.maps.map_file import MapFile
+from sensors.mcap.frames import read_frames
+from sensors.mcap.io import read_pieces, write_log
+from sensors.mcap.topics import CAMERA, FRAMES, LIDAR
+from sensors.motion import Motion
+from sensors.pieces import joined
+from sensors.records import Log, PoseFix
+
+Floats = NDArray[np.float64]
+
+PIECE_S = 10.0
+"""Of a log, after which its frames are matched."""
+
+
+class Setting(NamedTuple):
+    """matcher, vector_map: what frames are matched with; init: where each search begins (``initial_poses``), seed: of
+    its noise; ground_m: height of the ground under the vehicle in body axes, m, None: as the points show."""
+
+    matcher: Matcher
+    vector_map: MapFile
+    init: str
+    seed: int
+    ground_m: float | None
+    config: RunConfig
+
+
+class Pictured(NamedTuple):
+    """A match to look at. motion: of the vehicle around the frame; truth: (4, 4) T_map_body as the reference has it."""
+
+    frame: Frame
+    motion: Motion
+    match: Match
+    truth: Floats | None
+
+
+@dataclass(slots=True)
+class Chosen:
+    """The matches that somebody wants to see: so many from at_s after the log's first frame on."""
+
+    at_s: float
+    count: int
+    seen: list[Pictured] = field(default_factory=list)
+    first_ns: int | None = None
+
+    def wants(self, frame: Frame) -> bool:
+        """Whether this is one of them."""
+        if self.first_ns is None:
+            self.first_ns = frame.t_ns
+        return not self.complete and frame.t_ns >= self.first_ns + self.at_s * NS_PER_S
+
+    @property
+    def complete(self) -> bool:
+        """Whether there are enough."""
+        return len(self.seen) >= self.count
+
+
+@dataclass(slots=True)
+class Tally:
+    """What became of the frames; seconds: of each that was matched, its map and inputs included."""
+
+    frames: int = 0
+    fixes: int = 0
+    two_modes: int = 0
+    pieces_left_out: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+    seconds: list[float] = field(default_factory=list)
+
+    def add(self, match: Match) -> None:
+        """A frame that was matched."""
+        self.seconds.append(match.seconds)
+        self.pieces_left_out += match.left_out
+        self.fixes += match.found
+        self.two_modes += bool(match.weights[1] > 0.0)
+        if not match.found:
+            self.left_out[match.reason] += 1
+
+    def found(self) -> dict[str, Any]:
+        """JSON-ready."""
+        ms = 1e3 * np.array(self.seconds or [np.nan])
+        return {
+            "frames": self.frames,
+            "fixes": self.fixes,
+            "with_two_modes": self.two_modes,
+            "left_out": dict(self.left_out),
+            "map_pieces_left_out": self.pieces_left_out,
+            "ms": {"p50": float(np.median(ms)), "max": float(ms.max())} if self.seconds else None,
+        }
+
+
+def predict(
+    log: Path,
+    target: Path | None,
+    setting: Setting,
+    chosen: Chosen,
+    *,
+    keep_frames: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+) -> Tally:
+    """Match the frames of a log; the log with what was found goes to target, whole or not at all.
+
+    Without a target it ends as soon as the chosen matches are there. keep_frames: target has the frames as well.
+    Raises EgolocError where the log, or what the beginning of each search needs, is not there, where map and log are of
+    different map frames, no frame gave a fix, or no match was left to choose.
+    """
+    topics = setting.config.topics
+    columns = {sensor: topic for sensor, topic in topics.items() if sensor not in FRAMES}
+    columns |= {"reference": setting.init} if setting.init.startswith("/") else {}
+    used = setting.matcher.config
+    lidar = topics.get(LIDAR) if used.lidar is not None else ()
+    images = used.camera is not None
+    frames = read_frames(log, lidar, images=images, cameras=topics.get(CAMERA))
+    matching = _Matching(log, setting, chosen, Tally())
+    pieces = matching.pieces(read_pieces(log, columns, PIECE_S), frames, say)
+    if target is None:
+        for _ in takewhile(lambda _: not chosen.complete, pieces):
+            pass
+    else:
+        kept = read_frames(log, topics.get(LIDAR), cameras=topics.get(CAMERA)) if keep_frames else ()
+        write_log(target, pieces, frames=kept)
+    if not chosen.complete and not chosen.seen:
+        raise EgolocError(f"{log}: expected a frame to match from {chosen.at_s:g} s on, got none")
+    return matching.tally
+
+
+class _Matching:
+    """A log on its way through the matcher."""
+
+    def __init__(self, log: Path, setting: Setting, chosen: Chosen, tally: Tally) -> None:
+        self.tally = tally
+        self._log, self._setting, self._chosen = log, setting, chosen
+        self._starts: InitialPoses
+        self._truth: KnownPoses | None = None
+        self._arm = np.zeros(3)
+
+    def pieces(self, pieces: Iterable[Log], frames: Iterable[Frame], say: Callable[[str], None]) -> Iterator[Log]:
+        """The pieces, their pose fixes replaced by what the frames say. EgolocError at the end where there is none."""
+        waiting = _Waiting(frames)
+        for number, given in enumerate(pieces):
+            piece = self._placed(given)
+            if not number:
+                self._begin(piece)
+            self._starts.add(piece)
+            if self._truth is not None:
+                self._truth.add(piece)
+            rows = [fix for frame in waiting.until(self._starts.known_ns()) if len(fix := self._fix(frame))]
+            say(f"{self.tally.fixes} pose fixes of {self.tally.frames} frames")
+            yield replace(piece, pose_fixes=joined(rows) if rows else None)
+        for _ in waiting.until(None):
+            self._leave_out("after the last known pose")
+        if not self.tally.fixes:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in self.tally.left_out.most_common())
+            raise EgolocError(f"{self._log}: expected a frame that gives a fix, got none: {reasons or 'no frames'}")
+
+    def _placed(self, piece: Log) -> Log:
+        """With the config's vehicle and map frame."""
+        config = self._setting.config
+        return replace(piece, vehicle=config.vehicle or piece.vehicle, map_frame=config.map_frame or piece.map_frame)
+
+    def _begin(self, first: Log) -> None:
+        frame, setting = first.map_frame, self._setting
+        if frame is None:
+            raise EgolocError(f"{self._log}: expected a log with a map frame, or map_frame in --config, got none")
+        if frame != setting.vector_map.frame:
+            where, theirs = setting.vector_map.path, setting.vector_map.frame
+            raise EgolocError(f"{where}: expected a map in the log's map frame, {frame}, got {theirs}")
+        self._starts = initial_poses(setting.init, setting.seed, first.vehicle, frame, setting.config.fusion)
+        if not setting.init.startswith("/"):
+            self._truth = KnownPoses(None, 0, first.vehicle)
+        self._arm = np.array(first.vehicle.pose_lever_arm)
+
+    def _fix(self, frame: Frame) -> PoseFix:
+        """What a frame says, no row where it says nothing."""
+        start = self._starts.at(frame)
+        if isinstance(start, str):
+            self._leave_out(start)
+            return _NO_FIX
+        self.tally.frames += 1
+        wanted, setting = self._chosen.wants(frame), self._setting
+        T, motion = start
+        match = setting.matcher(frame, setting.vector_map, T, motion, ground_m=setting.ground_m, semantics=wanted)
+        self.tally.add(match)
+        if wanted:
+            self._chosen.seen.append(Pictured(frame, motion, match, self._true_pose(frame)))
+        fix = at_point(match.fix(), match.T_map_body[:2, :3] @ self._arm)
+        if len(fix):
+            self._starts.take(fix)
+        return fix
+
+    def _leave_out(self, reason: str) -> None:
+        self.tally.frames += 1
+        self.tally.left_out[reason] += 1
+
+    def _true_pose(self, frame: Frame) -> Floats | None:
+        found = None if self._truth is None else self._truth.at(frame)
+        return None if found is None or isinstance(found, str) else found.T_map_body
+
+
+def at_point(fix: PoseFix, apart: Floats) -> PoseFix:
+    """Fixes of the body's origin as those of a point of the body that lies apart (2,) m, map axes."""
+    x, y = apart
+    J = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
+    turn = fix.modes[..., 2] - fix.pose[:, None, 2]
+    c, s = np.cos(turn), np.sin(turn)
+    modes = fix.modes + np.stack((c * x - s * y, s * x + c * y, np.zeros_like(turn)), axis=-1)
+    return replace(fix, pose=fix.pose + np.array((x, y, 0.0)), cov=J @ fix.cov @ J.T, modes=modes)
+
+
+class _Waiting:
+    """Frames, each given out once its time has come."""
+
+    def __init__(self, frames: Iterable[Frame]) -> None:
+        self._frames = iter(frames)
+        self._next = next(self._frames, None)
+
+    def until(self, t_ns: int | None) -> Iterator[Frame]:
+        """Those up to a time; None: the rest."""
+        while self._next is not None and (t_ns is None or self._next.t_ns <= t_ns):
+            yield self._next
+            self._next = next(self._frames, None)
+
+
+_NO_FIX = PoseFix(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
