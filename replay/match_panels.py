@@ -17,27 +17,27 @@ from numpy.typing import NDArray
 from egovm.batch import SURFEL
 from egovm.projection import plane_height
 from replay.match_drawing import (
-    ABOVE_M,
     AGAINST,
     CLOSE_M,
     COLOURS,
     FOR,
-    HEIGHTS,
     NEUTRAL,
     Pictured,
     ends_at,
     estimated_offset,
-    heights_shaded,
     offset_of,
     points_of,
 )
 from replay.match_images import on_image
 from replay.match_levels import (
+    ABOVE_M,
+    HEIGHTS,
     SIGMAS,
     Histogram,
     basis_of,
     coloured,
     ellipse,
+    heights_shaded,
     planes_of,
     semantic_colours,
     shares,
