@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from matplotlib import colormaps
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -41,11 +40,6 @@ AGAINST, NEUTRAL, FOR = "#ff9d2e", "#7d858f", "#3fb4ff"
 """Of what a piece adds to the score: less than nothing, nothing, much."""
 CLOSE_M = 20.0
 """The map before and after is shown this far around the vehicle: farther, an offset is too small to be seen."""
-ABOVE_M = (-0.3, 4.0)
-"""Heights above the ground that become dark and bright."""
-HEIGHTS = "cividis"
-DARKEST = 0.25
-"""Of what the scales of points begin with, so that no point vanishes in the ground."""
 
 
 class Pictured(NamedTuple):
@@ -114,14 +108,6 @@ def error_of(match: Match, truth: Floats) -> Floats:
     c, s = np.cos(truth[2]), np.sin(truth[2])
     (x, y), yaw = match.pose[:2] - truth[:2], match.pose[2] - truth[2]
     return np.array((c * x + s * y, c * y - s * x, np.arctan2(np.sin(yaw), np.cos(yaw))))
-
-
-def heights_shaded(height: Floats) -> Floats:
-    """(N, 4) colours 0..1 of heights above the ground (N,) m."""
-    low, high = ABOVE_M
-    level = DARKEST + (1.0 - DARKEST) * ((height - low) / (high - low)).clip(0.0, 1.0)
-    colours: Floats = np.asarray(colormaps[HEIGHTS](level))
-    return colours
 
 
 def array(values: Tensor) -> Floats:

@@ -1,5 +1,5 @@
-"""What each level of a match's network made of a frame: colours of features and semantic maps, histograms, and what
-each piece of map adds to the score."""
+"""What each level of a match's network made of a frame: colours of features and semantic maps, histograms, what each
+piece of map adds to the score; and colours of points."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from matplotlib import colormaps
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -27,6 +28,11 @@ BRIGHTEST = 99.9
 """Percentile of a semantic map's probabilities that is drawn in full colour."""
 SIGMAS = 2.0
 """Ellipses and bands are so many sigmas wide to each side."""
+ABOVE_M = (-0.3, 4.0)
+"""Heights above the ground that become dark and bright."""
+HEIGHTS = "cividis"
+DARKEST = 0.25
+"""Of what the scales of points begin with, so that no point vanishes in the ground."""
 
 
 class Basis(NamedTuple):
@@ -171,3 +177,11 @@ def ellipse(found: Histogram) -> Floats:
     circle = np.stack((np.cos(angle), np.sin(angle)))
     around: Floats = (axes * np.sqrt(values.clip(min=0.0))) @ circle * SIGMAS
     return found.mean[:2] + around.T
+
+
+def heights_shaded(height: Floats) -> Floats:
+    """(N, 4) colours 0..1 of heights above the ground (N,) m."""
+    low, high = ABOVE_M
+    level = DARKEST + (1.0 - DARKEST) * ((height - low) / (high - low)).clip(0.0, 1.0)
+    colours: Floats = np.asarray(colormaps[HEIGHTS](level))
+    return colours

@@ -17,27 +17,27 @@ from numpy.typing import NDArray
 from egovm.batch import SURFEL
 from egovm.projection import plane_height
 from replay.match_drawing import (
-    ABOVE_M,
     AGAINST,
     CLOSE_M,
     COLOURS,
     FOR,
-    HEIGHTS,
     NEUTRAL,
     Pictured,
     ends_at,
     estimated_offset,
-    heights_shaded,
     offset_of,
     points_of,
 )
 from replay.match_images import on_image
 from replay.match_levels import (
+    ABOVE_M,
+    HEIGHTS,
     SIGMAS,
     Histogram,
     basis_of,
     coloured,
     ellipse,
+    heights_shaded,
     planes_of,
     semantic_colours,
     shares,
@@ -238,7 +238,7 @@ def _marks(axes: Any, pictured: Pictured, level: int, found: Histogram) -> None:
                 place = offset_of(match, mode)[1::-1]
                 axes.plot(*place, **MODE.look(), ls="")
                 words = {"fontsize": 10, "color": MODE.colour, "path_effects": OUTLINED}
-                axes.annotate(f"{weight:.2f}", place, (9, 7), textcoords="offset points", **words)
+                axes.annotate(f"{weight:.2f}", place, (0, 8), textcoords="offset points", ha="center", **words)
 
 
 def _yaw_panel(axes: Any, pictured: Pictured, found: Histogram) -> None:
@@ -260,7 +260,7 @@ def _yaw_panel(axes: Any, pictured: Pictured, found: Histogram) -> None:
 
 def _bar(axes: Any, scale: ScalarMappable, ticks: list[float], label: str) -> None:
     """A scale inside the panel, so that all panels stay as large."""
-    inset = axes.inset_axes((0.03, 0.045, 0.36, 0.022))
+    inset = axes.inset_axes((0.07, 0.045, 0.34, 0.022))
     bar = axes.figure.colorbar(scale, cax=inset, orientation="horizontal", location="top")
     bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
     bar.ax.tick_params(labelsize=9, length=2, pad=1, colors="white")
