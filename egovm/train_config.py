@@ -64,7 +64,7 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 SMALL_LIDAR = TrainConfig(
-    steps=700,
+    steps=1000,
     learning_rate=1e-3,
     warm_up=30,
     loss=LossConfig(rmse=1.0, solver=1.0, random_pose=0.1, samples=256, target="spread"),
