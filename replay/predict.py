@@ -54,9 +54,18 @@ class Chosen:
 
     def wants(self, frame: Frame) -> bool:
         """Whether this is one of them."""
-        if self.first_ns is None:
-            self.first_ns = frame.t_ns
+        assert self.first_ns is not None
         return not self.complete and frame.t_ns >= self.first_ns + self.at_s * NS_PER_S
+
+    def of(self, frames: Iterable[Frame], *, until_complete: bool, alone: bool) -> Iterator[Frame]:
+        """Frames of a log from its first on; until_complete: to the last of these at most; alone: these alone."""
+        for frame in frames:
+            if self.first_ns is None:
+                self.first_ns = frame.t_ns
+            if until_complete and self.complete:
+                return
+            if not alone or self.wants(frame):
+                yield frame
 
     @property
     def complete(self) -> bool:
@@ -108,7 +117,7 @@ def predict(
 ) -> Tally:
     """Match the frames of a log; the log with what was found goes to target, whole or not at all.
 
-    Without a target it ends as soon as the chosen matches are there. keep_frames: target has the frames as well.
+    Without a target the chosen frames alone are matched, with the filter those before as well. keep_frames: target has the frames as well.
     Raises EgolocError where the log, or what the beginning of each search needs, is not there, where map and log are of
     different map frames, no frame gave a fix, or no match was left to choose.
     """
@@ -120,15 +129,14 @@ def predict(
     images = used.camera is not None
     frames = read_frames(log, lidar, images=images, cameras=topics.get(CAMERA))
     matching = _Matching(log, setting, chosen, Tally())
-    pieces = matching.pieces(read_pieces(log, columns, PIECE_S), frames, say)
+    matched = chosen.of(frames, until_complete=target is None, alone=target is None and setting.init != "filter")
+    pieces = matching.pieces(read_pieces(log, columns, PIECE_S), matched, say)
     if target is None:
         for _ in takewhile(lambda _: not chosen.complete, pieces):
             pass
     else:
         kept = read_frames(log, topics.get(LIDAR), cameras=topics.get(CAMERA)) if keep_frames else ()
         write_log(target, pieces, frames=kept)
-    if not chosen.complete and not chosen.seen:
-        raise EgolocError(f"{log}: expected a frame to match from {chosen.at_s:g} s on, got none")
     return matching.tally
 
 
@@ -143,7 +151,7 @@ class _Matching:
         self._arm = np.zeros(3)
 
     def pieces(self, pieces: Iterable[Log], frames: Iterable[Frame], say: Callable[[str], None]) -> Iterator[Log]:
-        """The pieces, their pose fixes replaced by what the frames say. EgolocError at the end where there is none."""
+        """The pieces, their pose fixes replaced by what the frames say. EgolocError at the end for want of any."""
         waiting = _Waiting(frames)
         for number, given in enumerate(pieces):
             piece = self._placed(given)
@@ -157,6 +165,8 @@ class _Matching:
             yield replace(piece, pose_fixes=joined(rows) if rows else None)
         for _ in waiting.until(None):
             self._leave_out("after the last known pose")
+        if self._chosen.count and not self._chosen.seen:
+            raise EgolocError(f"{self._log}: expected a frame to match from {self._chosen.at_s:g} s on, got none")
         if not self.tally.fixes:
             reasons = ", ".join(f"{count} {reason}" for reason, count in self.tally.left_out.most_common())
             raise EgolocError(f"{self._log}: expected a frame that gives a fix, got none: {reasons or 'no frames'}")

@@ -53,9 +53,11 @@ class TrueMatcher:
     def __init__(self, truth: AlongTrajectory) -> None:
         self.truth = truth
         self.began: list[tuple[int, Floats, Motion]] = []
+        self.semantic: set[int] = set()
 
     def __call__(self, frame: Frame, _: MapFile, T_map_init: Floats, motion: Motion, **asked: Any) -> Match:
         self.began.append((frame.t_ns, T_map_init, motion))
+        self.semantic |= {frame.t_ns} if asked["semantics"] else set()
         answer = nothing("no landmarks", T_map_init, 3, 0)
         if len(self.began) % 3:
             pose = self.truth.poses.pose(frame.t_ns)
@@ -161,6 +163,27 @@ def test_the_filter_says_where_to_search_once_it_is_aligned(made: Made, vector_m
     here = later[:3, :3] @ p[0] + later[:3, 3]
     true = matcher.truth.poses.pose(t)
     assert np.allclose(motion.carried(p, t + 50_000_000, t)[0], true[:3, :3].T @ (here - true[:3, 3]), atol=0.05)
+
+
+def test_pictures_are_of_the_frames_that_were_asked_for(made: Made, vector_map: MapFile, tmp_path: Path) -> None:
+    """Each begins so many seconds after the log's first frame; what need not be matched is not."""
+    for init, target, matched in (
+        ("reference", None, 4),
+        ("filter", None, None),
+        ("reference", tmp_path / "out.mcap", made.frames),
+    ):
+        matcher, chosen = made.matcher(), Chosen(20.0, 4)
+        tally = predict(made.log, target, setting(matcher, vector_map, init), chosen)
+        assert tally.frames == (matched or 40 + 4)
+        stamps = [(one.match.t_ns - chosen.first_ns) / NS_PER_S for one in chosen.seen]  # type: ignore[operator]
+        assert stamps == [20.0, 20.5, 21.0, 21.5]
+        true = planar_of(matcher.truth.poses.pose(chosen.seen[0].match.t_ns))
+        assert chosen.seen[0].truth == pytest.approx(true)
+        asked = [t for t, *_ in matcher.began if t in matcher.semantic]
+        assert asked == [one.match.t_ns for one in chosen.seen]
+    with pytest.raises(EgolocError, match=r"expected a frame to match from 90 s on, got none"):
+        predict(made.log, tmp_path / "b", setting(made.matcher(), vector_map, "reference"), Chosen(90.0, 1))
+    assert not (tmp_path / "b").exists()
 
 
 def test_fixes_tell_the_point_that_the_vehicle_says() -> None:
