@@ -135,4 +135,4 @@ def add_lattice_sums(dots: Any, local: Any, size: int, into: Any) -> None:
 @kernel(inline="always")
 def _first(place: Any, room: int) -> int:
     """The cell before a place, such that what is read lies on the patch."""
-    return min(max(int(math.floor(place)), 0), room - 1)
+    return min(max(math.floor(place), 0), room - 1)

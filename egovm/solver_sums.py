@@ -31,7 +31,7 @@ def lattice_sums(dots: Tensor, local: Tensor, share: float, steps: int) -> Tenso
     for group in dots.unbind(2):
         arrays = [array.detach().contiguous().numpy() for array in (group.flatten(2), local)]
         add_lattice_sums(*arrays, size, found.numpy())
-    return found.unflatten(-1, (steps, size))[..., :steps].flip(-2, -1) * share
+    return torch.unflatten(found, -1, (steps, size))[..., :steps].flip(-2, -1) * share
 
 
 @lattice_sums.register_fake
