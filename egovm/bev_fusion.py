@@ -97,7 +97,7 @@ class FusionLayer(nn.Module):
         """(B, Q, C) queries after the layer. own: (1, Q, 1, 2) their cells; cells and seen: as ImageAttention's."""
         side = round(x.shape[1] ** 0.5)
         normed = self.norms[0](x)
-        plane = normed.unflatten(1, (side, side))
+        plane = torch.unflatten(normed, 1, (side, side))
         x = x + self.around(normed + position, own.expand(len(x), -1, -1, -1), plane)
         x = x + self.images(self.norms[1](x) + position, features, cells, seen)
         found: Tensor = x + self.feed(self.norms[2](x))

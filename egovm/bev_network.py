@@ -34,7 +34,7 @@ class BevNetwork(nn.Module):
         self.queries = GridEmbedding(config.bev.cells(0), config.bev.channels[0])
         self.pyramid = BevPyramid(config)
         self.precision: torch.dtype | None = None
-        """Of convolutions and matrix products where it is not the weights' own; maps are given in float32 then."""
+        """Of convolutions and matrix products where it is not the weights' own; maps are then given as they come."""
 
     def forward(self, points: Points | None, images: Images | None) -> tuple[Tensor, ...]:
         """Maps of all levels. What the network has no encoder for is not looked at.
@@ -51,7 +51,7 @@ class BevNetwork(nn.Module):
             if images is not None and self.camera is not None and self.fusion is not None:
                 bev = self.fusion(bev, self.camera(images.rgb), images)
             maps: tuple[Tensor, ...] = self.pyramid(bev, fine)
-        return maps if self.precision is None else tuple(level.float() for level in maps)
+        return maps
 
     def _precise(self) -> AbstractContextManager[object]:
         if self.precision is None:

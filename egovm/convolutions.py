@@ -1,6 +1,7 @@
 """The convolutions that all parts are built of, and what makes them fast once they are trained."""
 
 import copy
+from typing import Any
 
 import torch
 from torch import fx, nn
@@ -33,12 +34,11 @@ def deployed(network: nn.Module, precision: torch.dtype | None = None) -> nn.Mod
     for module in list(found.modules()):
         if isinstance(module, nn.Sequential):
             _fold(module)
-        if hasattr(module, "backbone"):
-            fold_traced(module.backbone)
+        if isinstance(backbone := getattr(module, "backbone", None), nn.Module):
+            fold_traced(backbone)
     if precision is not None:
         for module in found.modules():
             if hasattr(module, "precision"):
-                module.precision = precision
                 _convert(module, precision)
     return found.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
@@ -88,8 +88,9 @@ def _fold(chain: nn.Sequential) -> None:
             chain[index - 1], chain[index] = fuse_conv_bn_eval(before, norm), nn.Identity()
 
 
-def _convert(network: nn.Module, precision: torch.dtype) -> None:
-    """Weights of layers that autocast would convert at each call."""
+def _convert(network: Any, precision: torch.dtype) -> None:
+    """Tell it the type, and convert the weights that autocast would convert at each call."""
+    network.precision = precision
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             module.to(precision)

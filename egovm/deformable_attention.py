@@ -30,17 +30,18 @@ def deformable_sum(values: Tensor, cells: Tensor, weights: Tensor) -> Tensor:
     base = torch.floor(cells)
     row, column = (cells - base).unbind(-1)
     rows, columns = _sides(row, base[..., 0], height), _sides(column, base[..., 1], width)
-    sample = torch.arange(samples, device=cells.device)[:, None, None, None] * height
-    group = torch.arange(groups, device=cells.device)[:, None]
-    table = precise.reshape(-1, channels)
+    sample = torch.arange(samples, dtype=torch.int32, device=cells.device)[:, None, None, None] * height
+    group = torch.arange(groups, dtype=torch.int32, device=cells.device)[:, None]
+    # what a row and what a column adds to the index, so that a corner costs one sum and one product
+    rows = [(weights * weight, (sample + at) * (width * groups) + group) for weight, at in rows]
+    columns = [(weight, at * groups) for weight, at in columns]
+    table, bags = precise.reshape(-1, channels), (-1, weights.shape[-1])
     total = table.new_zeros(())
     for i, j in _CORNERS:
-        (row_weight, row), (column_weight, column) = rows[i], columns[j]
-        index = ((sample + row) * width + column) * groups + group
         total = total + nn.functional.embedding_bag(
-            index.reshape(-1, weights.shape[-1]),
+            (rows[i][1] + columns[j][1]).reshape(bags),
             table,
-            per_sample_weights=(weights * row_weight * column_weight).reshape(-1, weights.shape[-1]),
+            per_sample_weights=(rows[i][0] * columns[j][0]).reshape(bags),
             mode="sum",
         )
     return total.reshape(*weights.shape[:-1], channels)
@@ -55,7 +56,7 @@ def sampled_sum(values: Tensor, cells: Tensor, weights: Tensor) -> Tensor:
     maps = values.permute(0, 3, 4, 1, 2).flatten(0, 1)
     read = nn.functional.grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
     summed = (read * weights.transpose(1, 2).flatten(0, 1)[:, None]).sum(-1)
-    return summed.unflatten(0, (samples, groups)).permute(0, 3, 1, 2)
+    return torch.unflatten(summed, 0, (samples, groups)).permute(0, 3, 1, 2)
 
 
 def _sides(part: Tensor, base: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
@@ -64,7 +65,7 @@ def _sides(part: Tensor, base: Tensor, count: int) -> list[tuple[Tensor, Tensor]
     for side, weight in enumerate((1.0 - part, part)):
         at = base + side
         inside = (at >= 0) & (at < count)
-        found.append((weight * inside, at.clamp(0, count - 1).to(torch.int64)))
+        found.append((weight * inside, at.clamp(0, count - 1).to(torch.int32)))
     return found
 
 
@@ -105,12 +106,12 @@ class DeformableAttention(nn.Module):
         offsets = self.offsets(queries).reshape(*shape, 2)
         # points first: a softmax over the last axis is slow where it has only a few entries
         weights = self.weights(queries).reshape(shape).permute(3, 0, 1, 2).softmax(0)
-        return offsets, weights.permute(1, 2, 3, 0)
+        return offsets, weights.permute(1, 2, 3, 0).contiguous()
 
     def valued(self, seen: Tensor) -> Tensor:
         """(B, H, W, heads, C / heads) what is read of a map (B, H, W, C)."""
         found: Tensor = self.values(seen)
-        return found.unflatten(-1, (self.heads, -1))
+        return torch.unflatten(found, -1, (self.heads, -1))
 
     def at(self, references: Tensor, offsets: Tensor) -> Tensor:
         """(..., heads, P, 2) places: references (..., R, 2), each for P / R of the points, and offsets around them."""
@@ -125,7 +126,7 @@ class DeformableAttention(nn.Module):
         return found
 
     def read_first(self, queries: Tensor, references: Tensor, seen: Tensor, position: Tensor) -> Tensor:
-        """The same of seen (B, H, W, C) + position, for fewer queries than cells: up to rounding ``forward`` of the sum.
+        """``forward`` of seen (B, H, W, C) + position, up to rounding: faster where queries are fewer than cells.
 
         position: (H, W, C + 1), a 1 behind the encoding of each cell, by which is known how much of the weight, and so
         of the bias, lies on the map.
@@ -136,9 +137,9 @@ class DeformableAttention(nn.Module):
         of_seen = deformable_sum(seen[:, :, :, None], cells, weights)
         encoded = deformable_sum(position[None, :, :, None], cells.flatten(0, 1)[None], weights.flatten(0, 1)[None])
         encoded = encoded.reshape(*of_seen.shape[:-1], -1)
-        read = (of_seen + encoded[..., :-1]).unflatten(1, (-1, self.heads))[..., 0, :]
-        share = encoded[..., -1:].unflatten(1, (-1, self.heads))[..., 0, :]
-        layer = self.values.weight.unflatten(0, (self.heads, -1)), self.values.bias.unflatten(0, (self.heads, -1))
-        projected = torch.einsum("bqhc,hdc->bqhd", read, layer[0]) + share * layer[1]
+        read = torch.unflatten(of_seen + encoded[..., :-1], 1, (-1, self.heads))[..., 0, :]
+        share = torch.unflatten(encoded[..., -1:], 1, (-1, self.heads))[..., 0, :]
+        weight, bias = (torch.unflatten(each, 0, (self.heads, -1)) for each in (self.values.weight, self.values.bias))
+        projected = torch.einsum("bqhc,hdc->bqhd", read, weight) + share * bias
         found: Tensor = self.out(projected.flatten(2))
         return found

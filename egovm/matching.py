@@ -84,7 +84,7 @@ class Matching(nn.Module):
         looked_at = elements.ends[..., :2]
         looked_at = looked_at.mean(2, keepdim=True) if self.at_middle else looked_at
         cells = self.grid.cells_from_m(looked_at).to(queries.dtype)
-        seen = bev.permute(0, 2, 3, 1)
+        seen = bev.permute(0, 2, 3, 1).to(queries.dtype)
         for layer in self.layers:
             queries = layer(queries, elements.valid, cells, seen, self.position)
         matched = self.last(queries)

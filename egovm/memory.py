@@ -14,7 +14,7 @@ _KEPT = 1 << 30
 
 
 def keep_freed_memory() -> bool:
-    """Tell the C library to keep up to a GB of what is freed; whether it does. Where it is not glibc nothing changes."""
+    """Tell the C library to keep up to a GB of what is freed; whether it does. Only glibc has a way to."""
     if sys.platform != "linux":
         return False
     change = getattr(ctypes.CDLL(None), "mallopt", None)

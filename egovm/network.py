@@ -18,8 +18,8 @@ from egovm.semantics import SemanticHead
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """Of B frames. bev: of each level (B, C, H, W), channels_last; embeddings: of each level (B, K, C); logits: of each
-    level (B, TYPES - 1, H, W), empty where they are not asked for."""
+    """Of B frames. bev: of each level (B, C, H, W), channels_last, in float32 or as ``deployed`` was told; embeddings:
+    of each level (B, K, C); logits: of each level (B, TYPES - 1, H, W), empty where they are not asked for."""
 
     bev: tuple[Tensor, ...]
     embeddings: tuple[Tensor, ...]

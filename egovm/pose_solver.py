@@ -175,8 +175,13 @@ def _precise(features: Tensor) -> torch.dtype:
 
 
 def _by_kernel_type(features: Tensor, kind: torch.dtype) -> Tensor:
-    """On the CPU in the type of the kernels; elsewhere patches are converted as they are gathered."""
-    return features.to(kind) if features.device.type == "cpu" else features
+    """On the CPU in a type of the kernels; elsewhere patches are converted as they are gathered.
+
+    bfloat16 is read as it is unless gradients are wanted.
+    """
+    if features.device.type != "cpu" or (features.dtype == torch.bfloat16 and not features.requires_grad):
+        return features
+    return features.to(kind)
 
 
 def _elements(window: Window, part: slice) -> Window:

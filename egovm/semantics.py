@@ -25,6 +25,6 @@ class SemanticHead(nn.Module):
         """Logits (B, TYPES - 1, H, W) of each level's features (B, C, H, W). embeddings: (TYPES, C of level 0)."""
         seen = embeddings[:SURFEL]
         return tuple(
-            torch.einsum("bchw,tc->bthw", level, projection(seen)) + bias
+            torch.einsum("bchw,tc->bthw", level.to(seen.dtype), projection(seen)) + bias
             for level, projection, bias in zip(features, self.projections, self.bias, strict=True)
         )

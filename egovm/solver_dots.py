@@ -45,7 +45,7 @@ def gathered_dots(
 
 @torch.library.custom_op("egovm::patch_dots", mutates_args=())
 def _patch_dots(features: Tensor, embeddings: Tensor, corners: Tensor, valid: Tensor, size: int, groups: int) -> Tensor:
-    if not _by_kernel(features, embeddings):
+    if not (_by_kernel(features, embeddings) or _short(features, embeddings)):
         return gathered_dots(features, embeddings, corners, valid, size, groups)
     samples, points = valid.shape
     dots = embeddings.new_zeros((samples, points, groups, size, size))
@@ -105,9 +105,15 @@ def _by_kernel(features: Tensor, embeddings: Tensor) -> bool:
     return features.device.type == "cpu" and features.dtype == embeddings.dtype in (torch.float32, torch.float64)
 
 
+def _short(features: Tensor, embeddings: Tensor) -> bool:
+    """Features that the forward kernel reads in half as many bytes."""
+    return features.device.type == "cpu" and (features.dtype, embeddings.dtype) == (torch.bfloat16, torch.float32)
+
+
 def _arrays(*tensors: Tensor) -> list[object]:
-    """Contiguous numpy views: other strides would each be compiled anew."""
-    return [each.detach().contiguous().numpy() for each in tensors]
+    """Contiguous numpy views, bfloat16 as its bits: other strides would each be compiled anew."""
+    laid = [each.detach().contiguous() for each in tensors]
+    return [(each.view(torch.uint16) if each.dtype == torch.bfloat16 else each).numpy() for each in laid]
 
 
 def _order(corners: Tensor) -> Tensor:

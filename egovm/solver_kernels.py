@@ -8,17 +8,40 @@ long. What the innermost loops walk along is taken as a view before them, so tha
 import math
 from typing import Any
 
+import numba
+import numpy as np
+from numba.extending import overload
+
 from sensors.kernel import kernel
 
 _SUMS = {"reassoc", "contract"}
 """Sums may be taken in any order, NaN and infinity stay what they are."""
 
 
+def number(held: Any) -> Any:
+    """What an array holds: a float as it is, or the upper 16 bits of a float32 (bfloat16, which numpy has not)."""
+    raise NotImplementedError("compiled code alone calls this")
+
+
+def _as_it_is(held: Any) -> Any:
+    return held
+
+
+def _from_bits(held: Any) -> Any:
+    return np.uint32(np.uint32(held) << np.uint32(16)).view(np.float32)
+
+
+@overload(number)  # type: ignore[untyped-decorator]
+def _number(held: Any) -> Any:
+    return _from_bits if isinstance(held, numba.types.Integer) else _as_it_is
+
+
 @kernel(nogil=True, fastmath=_SUMS)
 def dot_patches(features: Any, embeddings: Any, corners: Any, valid: Any, order: Any, dots: Any) -> None:
     """Fill dots (B, N, G, S, S) of valid points: of each of G groups of channels, over a patch.
 
-    features: (B, H, W, G, C); embeddings: (B, N, G, C); corners: (B, N, 2) int64 first row and column of the patch;
+    features: (B, H, W, G, C), also uint16 bits of bfloat16; embeddings: (B, N, G, C); corners: (B, N, 2) int64 first
+    row and column of the patch;
     valid: (B, N) bool; order: (B, N) in which the points are taken, neighbours after each other so that what they share
     is still in the cache. A point that asks for the same as the one before it, as both ends of a surfel do, has its
     dots.
@@ -44,7 +67,7 @@ def dot_patches(features: Any, embeddings: Any, corners: Any, valid: Any, order:
                         cell = cells[column + c, g]
                         total = dots.dtype.type(0)
                         for k in range(channels):
-                            total += cell[k] * embedding[k]
+                            total += number(cell[k]) * embedding[k]
                         line[c] = total
 
 
@@ -110,21 +133,25 @@ def add_feature_gradient(embeddings: Any, corners: Any, valid: Any, gradient: An
 
 
 @kernel(nogil=True, fastmath=_SUMS)
-def add_lattice_sums(dots: Any, local: Any, size: int, into: Any) -> None:
+def add_lattice_sums(dots: Any, local: Any, times: Any, size: int, into: Any) -> None:
     """Add to into (B, yaw, n S) the points' dots (B, N, S S), read bilinearly around where each lies in its patch.
 
-    local: (B, N, yaw, 2) row and column in the patch; candidate (i, j) reads i rows and j columns beyond it. The last
-    S - n columns of into mean nothing: they let one loop run through all rows.
+    local: (B, N, yaw, 2) row and column in the patch; candidate (i, j) reads i rows and j columns beyond it; times:
+    (B, N) how often each point counts, those that do not are not looked at. The last S - n columns of into mean
+    nothing: they let one loop run through all rows.
     """
     samples, points, yaws, _ = local.shape
     steps = into.shape[2] // size
     for b in range(samples):
         for n in range(points):
+            if times[b, n] == 0:
+                continue
             for yaw in range(yaws):
                 row, column = _first(local[b, n, yaw, 0], size - steps), _first(local[b, n, yaw, 1], size - steps)
                 down, right = local[b, n, yaw, 0] - row, local[b, n, yaw, 1] - column
-                first, second = (1 - down) * (1 - right), (1 - down) * right
-                third, fourth = down * (1 - right), down * right
+                upper, lower = times[b, n] * (1 - down), times[b, n] * down
+                first, second = upper * (1 - right), upper * right
+                third, fourth = lower * (1 - right), lower * right
                 corner, flat = row * size + column, into[b, yaw]
                 above, beside = dots[b, n, corner:], dots[b, n, corner + 1 :]
                 below, across = dots[b, n, corner + size :], dots[b, n, corner + size + 1 :]
@@ -135,4 +162,5 @@ def add_lattice_sums(dots: Any, local: Any, size: int, into: Any) -> None:
 @kernel(inline="always")
 def _first(place: Any, room: int) -> int:
     """The cell before a place, such that what is read lies on the patch."""
-    return min(max(int(math.floor(place)), 0), room - 1)
+    first: int = min(max(math.floor(place), 0), room - 1)
+    return first

@@ -19,21 +19,21 @@ def can_sum(dots: Tensor, local: Tensor) -> bool:
 
 
 @torch.library.custom_op("egovm::lattice_sums", mutates_args=())
-def lattice_sums(dots: Tensor, local: Tensor, share: float, steps: int) -> Tensor:
+def lattice_sums(dots: Tensor, local: Tensor, times: Tensor, steps: int) -> Tensor:
     """(B, yaw, steps, steps) sums over N points, translations rising.
 
-    dots: (B, N, G, S, S), 0 of points that do not count; local: (B, N, yaw, 2) row and column in the patch of a point
-    under each yaw, for the largest translation; share: what each point counts.
+    dots: (B, N, G, S, S); local: (B, N, yaw, 2) row and column in the patch of a point under each yaw, for the largest
+    translation; times: (B, N) how often each point counts.
     """
     samples, _, around, _ = local.shape
     size = dots.shape[-1]
     found = dots.new_zeros((samples, around, steps * size))
     for group in dots.unbind(2):
-        arrays = [array.detach().contiguous().numpy() for array in (group.flatten(2), local)]
+        arrays = [array.detach().contiguous().numpy() for array in (group.flatten(2), local, times)]
         add_lattice_sums(*arrays, size, found.numpy())
-    return found.unflatten(-1, (steps, size))[..., :steps].flip(-2, -1) * share
+    return torch.unflatten(found, -1, (steps, size))[..., :steps].flip(-2, -1)
 
 
 @lattice_sums.register_fake
-def _(dots: Tensor, local: Tensor, share: float, steps: int) -> Tensor:
+def _(dots: Tensor, local: Tensor, times: Tensor, steps: int) -> Tensor:
     return dots.new_empty((*local.shape[:1], local.shape[2], steps, steps))

@@ -105,9 +105,8 @@ def summed_lattice_dots(window: Window) -> Tensor:
     """Sum (B, yaw, x, y) over the elements and groups of their dots: as ``lattice_dots``, but no element is kept."""
     local = _local(window)
     if can_sum(window.dots, local):
-        summed: Tensor = lattice_sums(
-            window.dots.flatten(1, 2), local.flatten(1, 2), 1.0 / local.shape[2], window.lattice.steps
-        )
+        flat = window.dots.flatten(1, 2), local.flatten(1, 2), _times(window).flatten(1, 2)
+        summed: Tensor = lattice_sums(*flat, window.lattice.steps)
         return summed
     return gathered_lattice_dots(window)
 
@@ -198,6 +197,16 @@ def _read(window: Window) -> tuple[Tensor, Tensor]:
     flat = index.flatten(3)[:, :, :, None].expand(-1, -1, -1, window.dots.shape[3], -1)
     patches = window.dots.flatten(4).gather(4, flat)
     return torch.unflatten(patches, -1, (local.shape[3], len(steps) ** 2)), weights[:, :, :, None]
+
+
+def _times(window: Window) -> Tensor:
+    """(B, K, P) what each point counts of its element; of points that all lie in one place the first stands for all."""
+    places = window.places
+    points = places.shape[2]
+    together = (places == places[:, :, :1]).flatten(2).all(-1)[..., None]
+    alone = torch.arange(points, device=places.device) == 0
+    counted = torch.where(together, alone.to(places.dtype), torch.full_like(places[..., 0], 1.0 / points))
+    return counted * window.valid[..., None]
 
 
 def _local(window: Window) -> Tensor:

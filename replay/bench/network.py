@@ -35,7 +35,7 @@ Rows = list[dict[str, Any]]
 
 
 def run(repeats: int = 5, paper: bool = True) -> dict[str, Any]:
-    """Times of ``small`` and ``small-lidar``, sizes of all presets; paper: also a training step of ``paper``, minutes."""
+    """Times of ``small`` and ``small-lidar``, sizes of all; paper: also a training step of ``paper``, minutes."""
     threads = torch.get_num_threads()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
@@ -139,7 +139,7 @@ def _sizes(config: NetworkConfig) -> Rows:
     """Parameters and multiply-adds of a frame in full mode with semantics, of the whole and by part."""
     torch.manual_seed(0)
     network = EgoVM(config).eval().requires_grad_(False)
-    ours = {torch.ops.egovm.patch_dots: _dots, torch.ops.egovm.lattice_sums: _sums}
+    ours: dict[Any, Any] = {torch.ops.egovm.patch_dots: _dots, torch.ops.egovm.lattice_sums: _sums}
     counter = FlopCounterMode(display=False, custom_mapping=ours)
     with torch.inference_mode(), counter:
         network(scene(config), semantics=True)

@@ -1,4 +1,4 @@
-"""What a vehicle with six cameras and a LiDAR sees, and a map around it, made up of noise: enough to time a network on."""
+"""What a vehicle with six cameras and a LiDAR sees, and a map around it, made up of noise: enough for timing."""
 
 import math
 
@@ -45,8 +45,9 @@ def _elements(config: NetworkConfig, random: torch.Generator) -> MapElements:
     ends = torch.stack((middle - along, middle + along), 1)
     normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=-1)
     ratios = torch.rand(count, 2, generator=random)
-    columns = type_, torch.nn.functional.pad(ends, (0, 1)), 5.0 * torch.rand(count, generator=random), normal, ratios
-    return MapElements(*(each[None] for each in columns), valid=torch.ones(1, count, dtype=torch.bool))
+    height, valid = 5.0 * torch.rand(count, generator=random), torch.ones(count, dtype=torch.bool)
+    columns = type_, torch.nn.functional.pad(ends, (0, 1)), height, normal, ratios, valid
+    return MapElements(*(each[None] for each in columns))
 
 
 def _points(half_m: float, random: torch.Generator) -> Points:

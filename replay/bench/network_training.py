@@ -1,4 +1,4 @@
-"""What one frame forward and backward through a whole preset, all losses with it, costs a fresh process: seconds, MB."""
+"""What one frame forward and backward through a preset, with all losses, costs a fresh process: seconds, and MB."""
 
 import subprocess
 import sys
@@ -30,9 +30,7 @@ def _step(preset: str) -> float:
     start = time.perf_counter()
     found = network(batch)
     draw = torch.Generator().manual_seed(0)
-    losses = network_losses(
-        LossConfig(), config.ablation, true, found.estimate, network.solver, found.logits, draw
-    )
+    losses = network_losses(LossConfig(), config.ablation, true, found.estimate, network.solver, found.logits, draw)
     losses.total.backward()  # type: ignore[no-untyped-call]
     if not all(p.grad.isfinite().all() for p in network.parameters() if p.grad is not None):
         raise FloatingPointError(f"{preset}: a gradient is not finite")

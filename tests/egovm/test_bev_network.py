@@ -8,7 +8,8 @@ from torch import Tensor
 from egovm.batch import Images, Points
 from egovm.bev_network import BevNetwork
 from egovm.config import PAPER, SMALL, BevConfig, CameraConfig, FusionConfig, LidarConfig, NetworkConfig
-from egovm.convolutions import deployed
+from egovm.convolutions import deployed, fold_traced
+from egovm.timm_models import backbone
 from sensors.errors import EgolocError
 from tests.egovm.scenes import TINY, images, no_points, points
 
@@ -115,7 +116,50 @@ def test_the_faster_copy_gives_the_same(mode: str) -> None:
     with torch.no_grad():
         close(deployed(tested)(*given(mode)), tested(*given(mode)), 1e-4)
     assert any(isinstance(module, torch.nn.BatchNorm2d) for module in tested.pyramid.modules())
-    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in deployed(tested.pyramid).modules())
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in deployed(tested).modules())
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_shorter_type_gives_nearly_the_same(mode: str) -> None:
+    """Off by what eight bits of each number make."""
+    tested = network()
+    with torch.no_grad():
+        short, exact = deployed(tested, torch.bfloat16)(*given(mode)), tested(*given(mode))
+    for a, b in zip(short, exact, strict=True):
+        assert 0.0 < float((a.float() - b).square().mean() / b.square().mean()) < 0.03**2
+    assert short[-1].dtype == torch.bfloat16
+    assert all(p.dtype == torch.float32 for p in tested.parameters())
+
+
+@pytest.mark.parametrize("name", ["mobilenetv3_small_050", "ese_vovnet39b"])
+def test_a_backbones_norms_are_folded(name: str) -> None:
+    """Those of timm's that have an activation in them, too."""
+    torch.manual_seed(1)
+    tested = backbone(name)
+    rgb = torch.randn(2, 3, 64, 64)
+    with torch.no_grad():
+        tested(rgb)  # norms that are not their first values
+        expected = tested.eval()(rgb)
+        fold_traced(tested)
+        found = tested(rgb)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in tested.modules())
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
+
+
+def test_what_cannot_be_traced_stays_as_it_is() -> None:
+    class Deciding(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer, self.norm = torch.nn.Conv2d(3, 3, 1), torch.nn.BatchNorm2d(3)
+
+        def forward(self, x: Tensor) -> Tensor:
+            found: Tensor = self.norm(self.layer(x)) if x.sum() > 0 else x
+            return found
+
+    tested = Deciding().eval()
+    fold_traced(tested)
+    assert isinstance(tested.norm, torch.nn.BatchNorm2d)
 
 
 def test_a_network_without_cameras() -> None:

@@ -8,6 +8,7 @@ import torch
 
 from egovm.batch import Batch, MapElements, Truth
 from egovm.config import ABLATIONS, PRESETS, NetworkConfig
+from egovm.convolutions import deployed
 from egovm.dataset import InitialNoise, TrainingBatches
 from egovm.network import EgoVM
 from egovm.pose_solver import PoseEstimate
@@ -47,6 +48,18 @@ def test_logits_come_when_asked_for_and_in_training(seen: tuple[Batch, Truth]) -
     assert shapes == [(2, 7, 64, 64), (2, 7, 128, 128), (2, 7, 256, 256)]
     assert given.eval()(seen[0]).logits == ()
     assert len(given(seen[0], semantics=True).logits) == 3
+
+
+def test_deployed_in_sixteen_bits_it_estimates_the_same(seen: tuple[Batch, Truth]) -> None:
+    """To a twentieth of the finest steps; it is not trained, so that posteriors are as wide as the windows."""
+    given = network().eval()
+    with torch.inference_mode():
+        exact, short = given(seen[0], semantics=True), deployed(given, torch.bfloat16)(seen[0], semantics=True)
+    assert torch.allclose(short.estimate.offset, exact.estimate.offset, atol=0.05 * 0.125)
+    assert not torch.equal(short.estimate.offset, exact.estimate.offset)
+    for a, b in zip(short.logits, exact.logits, strict=True):
+        assert a.dtype == torch.float32
+        assert (a - b).square().mean() < 0.03**2 * (b - b.mean()).square().mean()
 
 
 def test_a_prior_narrows_what_is_searched(seen: tuple[Batch, Truth]) -> None:

@@ -258,6 +258,18 @@ def test_gradients_are_not_left_to_the_kernel() -> None:
         assert can_sum(window.dots, window.places)
 
 
+def test_features_in_sixteen_bits_are_read_as_they_are() -> None:
+    """By the kernel, the dots of the numbers that they are rounded to."""
+    draw = torch.Generator().manual_seed(6)
+    features = torch.randn(2, 20, 20, 16, generator=draw).bfloat16()
+    embeddings, corners = torch.randn(2, 9, 16, generator=draw), torch.randint(0, 12, (2, 9, 2), generator=draw)
+    valid = torch.rand(2, 9, generator=draw) < 0.7
+    for groups in (1, 4):
+        found = patch_dots(features, embeddings, corners, valid, 8, groups)
+        expected = gathered_dots(features.double(), embeddings.double(), corners, valid, 8, groups)
+        assert torch.allclose(found.double(), expected, atol=1e-5)
+
+
 def test_points_that_ask_for_the_same_have_the_same_dots() -> None:
     """In any order; another embedding or another place is another point."""
     draw = torch.Generator().manual_seed(5)
