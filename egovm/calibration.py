@@ -30,6 +30,9 @@ from sensors.whole_file import whole_file
 
 Floats = NDArray[np.float64]
 
+WIDE_SHARE = 3.0 / 16.0
+"""Of a flat window's variance: sigma is then half of what the next level searches on either side, so that the truth may
+well lie beyond it."""
 _HEAD = """\
 # Covariances of the weights beside it: R = D Sigma D + diag(b step^2 / 12), D = diag(sqrt(a v^(power - 1))) with the
 # variances v of Sigma in step^2. Rows: levels, coarse to fine; columns: longitudinal, lateral, yaw.
@@ -96,8 +99,8 @@ class Calibration:
 
 
 def stated(calibration: Calibration, cov: ArrayLike, yaw: ArrayLike) -> Floats:
-    """(N, 3, 3) what a fix states: the last level's covariance calibrated, and along directions in which a level was
-    flat that level's as it is (``sensors.histogram``), in body axes at the last level's centre.
+    """(N, 3, 3) what a fix states, in body axes at the last level's centre: the last level's covariance calibrated, and
+    along directions in which a level was too wide for the next one that level's as it is (``sensors.histogram``).
 
     cov: (N, L, 3, 3) of the histograms; yaw: (N, L) of the levels' centres, rad. Infinite where the last level's is.
     """
@@ -113,7 +116,7 @@ def stated(calibration: Calibration, cov: ArrayLike, yaw: ArrayLike) -> Floats:
     lattice = calibration.lattice
     flat = steps_of(lattice) * np.sqrt((lattice.steps**2 - 1) / 12.0)
     found = calibration.calibrated(raw[:, -1], -1)
-    found[known] += stated_covariance(turned, flat) - turned[:, -1]
+    found[known] += stated_covariance(turned, flat, WIDE_SHARE) - turned[:, -1]
     return found
 
 

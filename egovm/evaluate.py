@@ -18,7 +18,7 @@ from torch.utils.data import Dataset
 from egovm.batch import Batch, Truth
 from egovm.calibration import Calibration, stated, steps_of
 from egovm.calibration_fit import fitted
-from egovm.convolutions import deployed
+from egovm.convolutions import deployed, native_precision
 from egovm.dataset import NOISES, EvaluationBatches, loader
 from egovm.honesty import AXES, honesty
 from egovm.judging import Judged, LevelErrors, joined, judged, level_errors
@@ -100,7 +100,7 @@ def calibrate(network: EgoVM, batches: EvaluationBatches, workers: int = 1, tell
 @torch.inference_mode()
 def errors_of(network: EgoVM, batches: EvaluationBatches | InTurns, workers: int, tell: Tell) -> Errors:
     """Run the network, ready for use, on every frame."""
-    fast: Any = deployed(network)
+    fast: Any = deployed(network, native_precision())
     initial, found, levels, seconds = [], [], [], []
     for number, (batch, truth) in enumerate(loader(batches, range(len(batches)), workers)):
         begin = time.perf_counter()

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from egovm.batch import Batch
 from egovm.calibration import read_calibration
-from egovm.convolutions import deployed
+from egovm.convolutions import deployed, native_precision
 from egovm.frame_inputs import FrameInputs, frame_inputs, lifted_axes
 from egovm.map_elements import Pieces, padded, pieces_around
 from egovm.match import NO_DATA, Match, answer_of, nothing
@@ -40,7 +40,7 @@ class Matcher:
             raise EgolocError(f"{weights}: ablation: solver: expected histogram, for regression states no covariance")
         network = EgoVM(self.config)
         load_weights(network, weights)
-        self._network: Any = deployed(network)
+        self._network: Any = deployed(network, native_precision())
         self._calibration = read_calibration(weights, self.config.solver.lattice)
         self._map_m = 1.5 * self.config.bev.half_m
 

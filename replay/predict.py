@@ -117,7 +117,8 @@ def predict(
 ) -> Tally:
     """Match the frames of a log; the log with what was found goes to target, whole or not at all.
 
-    Without a target the chosen frames alone are matched, with the filter those before as well. keep_frames: target has the frames as well.
+    Without a target the chosen frames alone are matched, with the filter those before as well. keep_frames: target has
+    the frames as well.
     Raises EgolocError where the log, or what the beginning of each search needs, is not there, where map and log are of
     different map frames, no frame gave a fix, or no match was left to choose.
     """

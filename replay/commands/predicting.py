@@ -58,6 +58,8 @@ class Predict:
     """Where pictures and recordings begin, s after the log's first frame."""
     count: Annotated[int, tyro.conf.arg(metavar="N")] = 10
     """How many matches the recording holds."""
+    threads: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Of the network. What it finds depends on them in the last digits."""
     overwrite: bool = False
     """Replace DEST."""
     json: bool = False
@@ -67,6 +69,8 @@ class Predict:
         """Match, write, draw, and say what was found."""
         # as in training: threads that wait for each other on a busy machine take the cores from what they wait for
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        import torch
+
         from egovm.infer import Matcher
         from egovm.weights import weights_path
         from replay.config import RunConfig, load_config
@@ -75,6 +79,7 @@ class Predict:
         from sensors.maps.map_file import open_map
 
         source = self._checked()
+        torch.set_num_threads(self.threads)
         check_init(self.init)
         config = RunConfig() if self.config is None else load_config(self.config)
         chosen = Chosen(self.at, self.count if self.rrd else int(self.png is not None))
@@ -105,10 +110,10 @@ class Predict:
             raise EgolocError("predict: expected --map MAP, the vector map to match against")
         if self.target is None and self.png is None and self.rrd is None:
             raise EgolocError("predict: expected DEST.mcap, --png FILE or --rrd FILE")
-        if not self.at >= 0.0 or self.count < 1 or self.seed < 0:
+        if not self.at >= 0.0 or min(self.count, self.threads) < 1 or self.seed < 0:
             raise EgolocError(
-                "predict: expected --at and --seed of 0 or more and --count of 1 or more, got"
-                f" {self.at}, {self.seed} and {self.count}"
+                "predict: expected --at and --seed of 0 or more, --count and --threads of 1 or more, got"
+                f" {self.at}, {self.seed}, {self.count} and {self.threads}"
             )
         if self.target is not None:
             check_new(self.target, [self.log, self.map], overwrite=self.overwrite)
