@@ -60,10 +60,14 @@ class Matcher:
         motion: around the frame; None: the vehicle stood. ground_m: height of the ground under the vehicle in body
         axes, m; None: as its points show. search: (3,) m, m, rad, half of what a prior leaves to be searched, which
         narrows the search only. semantics: the output has the semantic maps as well.
-        Raises EgolocError for an initial pose that is none or not upright, and images that cannot be decoded.
+        A search that leaves the truth out finds none of it: give it several sigmas.
+        Raises EgolocError for an initial pose that is none or not upright, a search that is not above 0, and images
+        that cannot be decoded.
         """
         begin = time.perf_counter()
         T_map_init = np.asarray(T_map_init, np.float64)
+        if T_map_init.shape != (4, 4):
+            raise EgolocError(f"T_map_init: expected shape (4, 4), got {T_map_init.shape}")
         check_rigid("T_map_init", T_map_init)
         inputs = frame_inputs([frame], self.config, [motion or Standing()], ground_m)
         T_body_lifted = lifted_axes(inputs.lifts[0])
@@ -96,9 +100,17 @@ class Matcher:
 
     @torch.inference_mode()
     def _run(self, batch: Batch, search: ArrayLike | None, *, semantics: bool) -> Output:
-        prior = None if search is None else torch.from_numpy(np.asarray(search, np.float32)[None])
+        prior = None if search is None else _checked(search)
         output: Output = self._network(batch, prior, semantics=semantics)
         return output
+
+
+def _checked(search: ArrayLike) -> torch.Tensor:
+    """(1, 3) float32."""
+    given = np.asarray(search, np.float32)
+    if given.shape != (3,) or not (given > 0.0).all():
+        raise EgolocError(f"search: expected three numbers above 0 (m, m, rad), got {given.tolist()}")
+    return torch.from_numpy(given[None])
 
 
 def _holds_data(inputs: FrameInputs) -> bool:

@@ -1,5 +1,6 @@
 """Where the search for a frame's pose begins: at a trajectory of the log, off it on purpose, or where a filter is."""
 
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -8,21 +9,28 @@ from numpy.typing import NDArray
 from egovm.dataset import NOISES, InitialNoise, planar
 from fusion.config import FusionConfig
 from fusion.filter import Localizer, State
+from replay.config import RunConfig
 from sensors.clock import NS_PER_S
 from sensors.errors import EgolocError
 from sensors.frames import Frame
 from sensors.geodesy import MapFrame, map_from_llh, rotation_map_enu
-from sensors.motion import AlongTrajectory, ConstantVelocity, Motion, along, relative, span_of
-from sensors.pieces import joined
+from sensors.mcap.io import read_pieces
+from sensors.mcap.topics import FRAMES
+from sensors.motion import ConstantVelocity, Motion, along, relative, span_of
+from sensors.pieces import SENSORS, joined
 from sensors.records import Imu, Log, PoseFix, Trajectory
 from sensors.rotation import matrix_from_q
-from sensors.vehicle import Vehicle
+from sensors.vehicle import Vector3, Vehicle
 
 Floats = NDArray[np.float64]
 
 NEVER_NS = -(2**62)
 _TAIL_NS = 3 * NS_PER_S
 """Of a trajectory, kept for frames that begin before the next piece."""
+_FRAME_NS = NS_PER_S // 2
+"""Points and images of a frame are at most so much later than its stamp, as long as the log goes on."""
+_CARRIED_NS = NS_PER_S // 5
+"""A filter's state is carried so far from its last IMU sample."""
 
 
 class Start(NamedTuple):
@@ -47,37 +55,47 @@ class InitialPoses(Protocol):
     def take(self, fix: PoseFix) -> None:
         """What was found there."""
 
+    def lacks(self) -> str | None:
+        """What the log would have to hold for any start."""
+
 
 class KnownPoses:
-    """Along a trajectory that the log holds as its reference, each frame off it by noise of its own."""
+    """Along a trajectory, each frame off it by noise of its own."""
 
-    def __init__(self, noise: InitialNoise | None, seed: int, vehicle: Vehicle) -> None:
-        """noise: None: the trajectory as it is; vehicle: knows the point whose trajectory it is."""
-        self._noise, self._seed, self._arm = noise, seed, vehicle.reference_lever_arm
-        self._rows: Trajectory | None = None
-        self._motion: AlongTrajectory | None = None
+    def __init__(self, noise: InitialNoise | None, seed: int, arm: Vector3, whole: Trajectory | None = None) -> None:
+        """noise: None: the trajectory as it is; arm: the point of the body whose trajectory it is, m; whole: all of it,
+        None: the reference of the pieces."""
+        self._noise, self._seed, self._arm = noise, seed, arm
+        self._rows = self._whole = whole
+        self._motion = None if whole is None else along(whole, arm)
+        self._last_ns = NEVER_NS
+        self._why_not = "no poses yet"
 
     def add(self, piece: Log) -> None:
         """The next piece."""
-        rows = piece.reference
-        if rows is None or not len(rows):
-            return
+        if self._whole is not None:
+            records = (getattr(piece, name) for name in SENSORS)
+            self._last_ns = max([self._last_ns, *(int(each.t_ns[-1]) for each in records if each is not None)])
+        elif piece.reference is not None and len(piece.reference):
+            self._go_on(piece.reference)
+
+    def _go_on(self, rows: Trajectory) -> None:
         if self._rows is not None:
             rows = joined([self._rows[self._rows.t_ns >= rows.t_ns[0] - _TAIL_NS], rows])
-        self._rows = rows
+        self._rows, self._last_ns = rows, int(rows.t_ns[-1])
         try:
             self._motion = along(rows, self._arm)
-        except EgolocError:  # too few rows with an attitude by now
-            self._motion = None
+        except EgolocError as error:  # more rows with an attitude may come
+            self._motion, self._why_not = None, str(error)
 
     def known_ns(self) -> int:
-        """A frame's points and images may be somewhat later than the frame."""
-        return NEVER_NS if self._rows is None else int(self._rows.t_ns[-1]) - _TAIL_NS // 6
+        """Where a frame's points and images end is known as well."""
+        return self._last_ns - _FRAME_NS
 
     def at(self, frame: Frame) -> Start | str:
         """The trajectory's pose, off by noise."""
         if self._motion is None:
-            return "no poses with an attitude"
+            return self._why_not
         if not self._motion.covers(*span_of(frame)):
             return "outside the trajectory"
         T = self._motion.poses.pose(frame.t_ns)
@@ -88,6 +106,10 @@ class KnownPoses:
 
     def take(self, fix: PoseFix) -> None:
         """Known poses learn nothing."""
+
+    def lacks(self) -> str | None:
+        """A trajectory."""
+        return "a reference for --init reference, got none" if self._rows is None else None
 
 
 class PredictedPoses:
@@ -115,7 +137,8 @@ class PredictedPoses:
     def at(self, frame: Frame) -> Start | str:
         """The filter's state, carried on from the last IMU sample to the frame as that sample says."""
         imu = self._imu
-        assert imu is not None
+        if imu is None:
+            return "no IMU samples"
         passed = int(np.searchsorted(imu.t_ns, frame.t_ns, side="right"))
         if passed:
             self._imu, self._gyro = imu[passed:], imu.gyro[passed - 1]
@@ -125,11 +148,17 @@ class PredictedPoses:
         state = self._localizer.state()
         if state is None:
             return "the filter was not aligned"
+        if frame.t_ns - state.t_ns > _CARRIED_NS:
+            return "in a gap of the IMU"
         return _carried(state, self._gyro - state.gyro_bias, self._frame, frame.t_ns)
 
     def take(self, fix: PoseFix) -> None:
         """The filter goes on with it."""
         self._localizer.push(fix)
+
+    def lacks(self) -> str | None:
+        """The IMU."""
+        return "IMU samples for --init filter, got none" if self._imu is None else None
 
 
 def _carried(state: State, turn_rate: Floats, map_frame: MapFrame, t_ns: int) -> Start:
@@ -155,10 +184,24 @@ def check_init(init: str) -> None:
 
 
 def initial_poses(
-    init: str, seed: int, vehicle: Vehicle, map_frame: MapFrame, config: FusionConfig
+    log: Path, init: str, seed: int, vehicle: Vehicle, map_frame: MapFrame, config: RunConfig
 ) -> KnownPoses | PredictedPoses:
-    """What ``check_init`` let pass. seed: of noise. The poses of a topic come as the log's reference."""
+    """What ``check_init`` let pass. seed: of noise. The poses of a topic are read at once."""
     if init == "filter":
-        return PredictedPoses(vehicle, map_frame, config)
+        return PredictedPoses(vehicle, map_frame, config.fusion)
+    if init.startswith("/"):
+        return KnownPoses(None, seed, vehicle.reference_lever_arm, _poses_of(log, init, config))
     noise = init.partition("+")[2]
-    return KnownPoses(NOISES[noise] if noise else None, seed, vehicle)
+    return KnownPoses(NOISES[noise] if noise else None, seed, vehicle.reference_lever_arm)
+
+
+def _poses_of(log: Path, topic: str, config: RunConfig) -> Trajectory:
+    """A log's poses of a topic."""
+    columns = {sensor: given for sensor, given in config.topics.items() if sensor not in FRAMES}
+    rows = [
+        piece.reference for piece in read_pieces(log, columns | {"reference": topic}) if piece.reference is not None
+    ]
+    if not rows:
+        raise EgolocError(f"{log}: {topic}: expected poses for --init, got none")
+    whole: Trajectory = joined(rows)
+    return whole

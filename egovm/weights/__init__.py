@@ -32,6 +32,8 @@ def save_weights(network: nn.Module, config: NetworkConfig, path: Path) -> None:
 
 def read_config(path: Path) -> NetworkConfig:
     """The config that lies beside weights, or a config file itself (.toml)."""
+    if path.suffix != ".toml":
+        _check_name(path)
     return read_toml(path.with_suffix(".toml"), NetworkConfig, "the network's config")
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from replay.commands.output import stage
+from replay.commands.output import check_drawings, stage
 from sensors.errors import EgolocError
 
 
@@ -38,6 +38,7 @@ class Frames:
             raise EgolocError(
                 f"frames: expected --at of 0 or more and --count of 1 or more, got {self.at} and {self.count}"
             )
+        check_drawings((self.png, self.rrd), (self.log, self.config))
         config = RunConfig() if self.config is None else load_config(self.config)
         with stage(f"reading {self.log}"):
             chosen = chosen_frames(self.log, config.topics, self.at, self.count)

@@ -2,10 +2,12 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from sensors.errors import EgolocError
 
 if TYPE_CHECKING:
     from replay.campaign import Campaign
@@ -54,6 +56,19 @@ def show_campaign(campaign: "Campaign", folder: Path, *, as_json: bool, paper: b
         where = folder / "LOG.error.txt"
         print(f"{len(failed)} of {campaign.logs['total']} logs failed{more}: see {where}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def check_drawings(drawings: Sequence[Path | None], others: Sequence[Path | None]) -> None:
+    """Raise where a picture or recording cannot be written, or would take the place of another file of the command."""
+    taken = [path.resolve() for path in others if path is not None]
+    for path in drawings:
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise EgolocError(f"{path}: expected a file of its own to draw into, got another of this command")
+        if path.is_dir() or not path.absolute().parent.is_dir():
+            raise EgolocError(f"{path}: cannot be written: expected a file in a folder that exists")
+        taken.append(path.resolve())
 
 
 @contextmanager

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from replay.commands.map_files import check_new
-from replay.commands.output import print_json, stage
+from replay.commands.output import check_drawings, print_json, stage
 from sensors.errors import EgolocError
 
 if TYPE_CHECKING:  # it brings torch along
     from replay.predict import Chosen
 
+MOST_M = 10.0
+"""Bodies ride no higher above the ground, m."""
 File = tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")
 
 
@@ -37,8 +39,8 @@ class Predict:
     weights: Annotated[str, tyro.conf.arg(metavar="W")] = "small-lidar"
     """small-lidar, or a safetensors file with its config beside it."""
     init: Annotated[str, tyro.conf.arg(metavar="HOW")] = "filter"
-    """Where each search begins. filter: where the filter is that has the log's sensors and the fixes so far; reference:
-    the log's reference; reference+NOISE: off it by noise, uniform (2.5 m, 2.5 deg), uniform-3 (3 m, 3 deg) or gauss
+    """Where each search begins. filter: where the filter is that has the log's IMU, GNSS and wheel and the fixes so far,
+    once the vehicle has moved; reference: the log's reference; reference+NOISE: off it by noise, uniform (2.5 m, 2.5 deg), uniform-3 (3 m, 3 deg) or gauss
     (1.5 m along, 0.75 m across, 0.85 deg); /TOPIC: poses of that topic."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Of the noise."""
@@ -57,7 +59,7 @@ class Predict:
     at: Annotated[float, tyro.conf.arg(metavar="S")] = 0.0
     """Where pictures and recordings begin, s after the log's first frame."""
     count: Annotated[int, tyro.conf.arg(metavar="N")] = 10
-    """How many matches the recording holds."""
+    """How many matches the recording holds; each takes some 80 MB until it is written."""
     threads: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Of the network. What it finds depends on them in the last digits."""
     overwrite: bool = False
@@ -106,6 +108,8 @@ class Predict:
 
     def _checked(self) -> Path:
         """The map."""
+        from egovm.weights import weights_path
+
         if self.map is None:
             raise EgolocError("predict: expected --map MAP, the vector map to match against")
         if self.target is None and self.png is None and self.rrd is None:
@@ -115,6 +119,10 @@ class Predict:
                 "predict: expected --at and --seed of 0 or more, --count and --threads of 1 or more, got"
                 f" {self.at}, {self.seed}, {self.count} and {self.threads}"
             )
+        if self.ground_m is not None and not abs(self.ground_m) <= MOST_M:
+            raise EgolocError(f"--ground-m: expected metres within {MOST_M:g} of 0, got {self.ground_m:g}")
+        given = self.log, self.map, self.config, self.target, weights_path(self.weights)
+        check_drawings((self.png, self.rrd), given)
         if self.target is not None:
             check_new(self.target, [self.log, self.map], overwrite=self.overwrite)
         return self.map
@@ -126,6 +134,10 @@ class Predict:
         print(f"{found['frames']} frames, {found['fixes']} pose fixes{took}")
         for reason, count in found["left_out"].items():
             print(f"  {count} left out: {reason}")
+        if found["at_edge"]:
+            print(f"  {found['at_edge']} fixes lie at the edge of the search: the truth may lie beyond it")
+        for row in found["log_left_out"]:
+            print(f"  of the log: {row['source']}: {row['count']} left out: {row['reason']}")
         for name, path in (("Log", self.target), ("Picture", self.png), ("Recording", self.rrd)):
             if path is not None:
                 print(f"{name}: {path}")

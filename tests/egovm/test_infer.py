@@ -135,6 +135,11 @@ def test_a_prior_narrows_the_search_only(matcher: Matcher, sample: Sample, vecto
 def test_what_cannot_be_used_is_refused(matcher: Matcher, sample: Sample, vector_map: MapFile, tmp_path: Path) -> None:
     with pytest.raises(EgolocError, match="T_map_init: expected a rigid transform"):
         matcher(frame_of(sample), vector_map, 2.0 * sample.T_map_body)
+    with pytest.raises(EgolocError, match=r"T_map_init: expected shape \(4, 4\), got \(3, 3\)"):
+        matcher(frame_of(sample), vector_map, np.eye(3))
+    for search in ((np.nan, 1.0, 1.0), (1.0, 0.0, 1.0), (1.0, 1.0)):
+        with pytest.raises(EgolocError, match="search: expected three numbers above 0"):
+            matcher(frame_of(sample), vector_map, sample.T_map_body, search=search)
     regressing = msgspec.structs.replace(PRESETS["small-lidar"], ablation=Ablation(solver="regression"))
     save_weights(EgoVM(regressing), regressing, tmp_path / "a6.safetensors")
     with pytest.raises(EgolocError, match=r"a6.safetensors: ablation: solver: expected histogram"):

@@ -112,10 +112,13 @@ def test_the_log_goes_on_with_the_new_fixes_alone(made: Made, vector_map: MapFil
     assert found.pose_fixes is not None
     assert tally.found() | {"ms": None} == {
         "frames": made.frames,
+        "matched": made.frames,
         "fixes": len(found.pose_fixes),
+        "at_edge": 0,
         "with_two_modes": 0,
         "left_out": {"no landmarks": made.frames // 3},
         "map_pieces_left_out": 0,
+        "log_left_out": [],
         "ms": None,
     }
     true = np.array([planar_of(matcher.truth.poses.pose(t)) for t in found.pose_fixes.t_ns])
@@ -141,9 +144,43 @@ def test_noise_is_of_the_frame_and_the_seed(made: Made, vector_map: MapFile, tmp
     assert (wide <= np.array((noise.lon_m, noise.lat_m, np.radians(noise.yaw_deg))) + 1e-9).all()
     assert (wide.max(0) > 0.8 * np.array((2.5, 2.5, np.radians(2.5)))).all()
     assert found["d"][:, 1].std() < 0.75 * found["a"][:, 1].std()
-    exact = made.matcher()
-    predict(made.log, tmp_path / "e", setting(exact, vector_map, "/reference"), Chosen(0.0, 0))
-    assert np.abs(exact.offsets()).max() < 1e-6
+
+
+def test_poses_of_a_topic_begin_searches_and_leave_the_reference_alone(
+    made: Made, vector_map: MapFile, tmp_path: Path
+) -> None:
+    """Those of the pose fixes that the log has, which end a little before it."""
+    matcher, target = made.matcher(), tmp_path / "out.mcap"
+    tally = predict(made.log, target, setting(matcher, vector_map, "/egovm/pose"), Chosen(30.0, 1))
+    assert tally.fixes > 0.6 * made.frames
+    away = np.abs(matcher.offsets()[:, :2]).max(axis=1)
+    assert 0.01 < np.median(away) < 0.5  # as far as the simulated fixes are
+    found, before = read_log(target).reference, made.drive.reference
+    assert found is not None
+    assert before is not None
+    assert np.array_equal(found.t_ns, before.t_ns)
+    assert np.allclose(found.p_map, before.p_map)
+
+
+def test_frames_to_the_end_of_the_log_are_matched_as_long_as_a_pose_is_known(
+    made: Made, vector_map: MapFile, tmp_path: Path
+) -> None:
+    drive = made.drive
+    assert drive.reference is not None
+    assert drive.imu is not None
+    first, last = int(drive.reference.t_ns[0]), int(drive.reference.t_ns[-1])
+    points = Sweep(np.array([[10.0, 0.0, 0.0]], np.float32))
+    short = tmp_path / "short.mcap"
+    stamps = [last - 290_000_000, last - 90_000_000, last + 100_000_000, last + 900_000_000]
+    write_log(short, drive, frames=(Frame(t, t, (points,)) for t in stamps))
+    for init, fixes, reason in (("reference", 2, "outside the trajectory"), ("filter", 2, "in a gap of the IMU")):
+        matcher = made.matcher()
+        tally = predict(short, None, setting(matcher, vector_map, init), Chosen(0.0, 10))
+        assert tally.fixes == fixes
+        assert tally.left_out[reason] == (2 if init == "reference" else 1)
+    brief = replace(drive, reference=drive.reference[(drive.reference.t_ns < first + 60_000_000)])
+    write_log(short, brief, frames=[Frame(first + 30_000_000, first, (points,))])
+    assert predict(short, None, setting(made.matcher(), vector_map, "reference"), Chosen(0.0, 1)).fixes == 1
 
 
 def test_the_filter_says_where_to_search_once_it_is_aligned(made: Made, vector_map: MapFile, tmp_path: Path) -> None:
@@ -183,7 +220,7 @@ def test_pictures_are_of_the_frames_that_were_asked_for(made: Made, vector_map: 
         assert asked == [one.match.t_ns for one in chosen.seen]
     with pytest.raises(EgolocError, match=r"expected a frame to match from 90 s on, got none"):
         predict(made.log, tmp_path / "b", setting(made.matcher(), vector_map, "reference"), Chosen(90.0, 1))
-    assert not (tmp_path / "b").exists()
+    assert len(read_log(tmp_path / "b").pose_fixes or ()) > 10  # a picture that cannot be drawn loses nothing
 
 
 def test_fixes_tell_the_point_that_the_vehicle_says() -> None:
@@ -222,14 +259,31 @@ def test_what_cannot_be_matched_is_told_and_writes_nothing(
         predict(made.log, target, setting(made.matcher(), other, "reference"), Chosen(0.0, 0))
     bare = tmp_path / "bare.mcap"
     write_log(bare, replace(made.drive, reference=None))
-    with pytest.raises(EgolocError, match=r"bare.mcap: expected a frame that gives a fix, got none: no frames"):
+    with pytest.raises(EgolocError, match=r"bare.mcap: expected a reference for --init reference, got none"):
         predict(bare, target, setting(made.matcher(), vector_map, "reference"), Chosen(0.0, 0))
+    with pytest.raises(EgolocError, match=r"bare.mcap: expected a frame that gives a fix, got none: no frames"):
+        predict(bare, target, setting(made.matcher(), vector_map, "filter"), Chosen(0.0, 0))
+    write_log(bare, replace(made.drive, imu=None))
+    with pytest.raises(EgolocError, match=r"bare.mcap: expected IMU samples for --init filter, got none"):
+        predict(bare, target, setting(made.matcher(), vector_map, "filter"), Chosen(0.0, 0))
     write_log(bare, Log(imu=made.drive.imu))
     with pytest.raises(EgolocError, match=r"bare.mcap: expected a log with a map frame"):
         predict(bare, target, setting(made.matcher(), vector_map, "filter"), Chosen(0.0, 0))
     for words, message in (
         ((made.log, target), "predict: expected --map MAP"),
         ((made.log, "--map", made.map), "predict: expected DEST.mcap, --png FILE or --rrd FILE"),
+        ((made.log, "--map", made.map, "--png", made.log), "drive.mcap: expected a file of its own to draw into"),
+        ((made.log, "--map", made.map, "--rrd", made.map), "map.parquet: expected a file of its own to draw into"),
+        ((made.log, "--map", made.map, "--png", target, "--rrd", target), "out.mcap: expected a file of its own"),
+        (
+            (made.log, "--map", made.map, "--png", tmp_path / "no" / "a.png"),
+            "a.png: cannot be written: expected a file in a folder",
+        ),
+        ((made.log, target, "--map", made.map, "--ground-m", "nan"), "--ground-m: expected metres within 10 of 0"),
+        (
+            (made.log, target, "--map", made.map, "--weights", made.log),
+            "drive.mcap: expected a name that ends in .safe",
+        ),
         ((made.log, target, "--map", made.map, "--init", "reference+far"), "--init: expected filter, reference, ref"),
         ((made.log, target, "--map", made.map, "--weights", tmp_path / "no.safetensors"), "no.toml: expected the net"),
         ((made.log, made.log, "--map", made.map), "drive.mcap: expected a file to write, got the source itself"),
