@@ -39,9 +39,9 @@ class Predict:
     weights: Annotated[str, tyro.conf.arg(metavar="W")] = "small-lidar"
     """small-lidar, or a safetensors file with its config beside it."""
     init: Annotated[str, tyro.conf.arg(metavar="HOW")] = "filter"
-    """Where each search begins. filter: where the filter is that has the log's IMU, GNSS and wheel and the fixes so far,
-    once the vehicle has moved; reference: the log's reference; reference+NOISE: off it by noise, uniform (2.5 m, 2.5 deg), uniform-3 (3 m, 3 deg) or gauss
-    (1.5 m along, 0.75 m across, 0.85 deg); /TOPIC: poses of that topic."""
+    """Where each search begins. filter: where the filter is that has the log's IMU, GNSS and wheel and the fixes so
+    far, once the vehicle has moved; reference: the log's reference; reference+NOISE: off it by noise, uniform (2.5 m,
+    2.5 deg), uniform-3 (3 m, 3 deg) or gauss (1.5 m along, 0.75 m across, 0.85 deg); /TOPIC: poses of that topic."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Of the noise."""
     ground_m: Annotated[
