@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from egovm.batch import Batch
+from egovm.batch import Batch, Images, MapElements, Points
 from egovm.calibration import read_calibration
+from egovm.config import NetworkConfig
 from egovm.convolutions import deployed, native_precision
 from egovm.frame_inputs import FrameInputs, frame_inputs, lifted_axes
 from egovm.map_elements import Pieces, padded, pieces_around
@@ -42,6 +43,7 @@ class Matcher:
         load_weights(network, weights)
         self._network: Any = deployed(network, native_precision())
         self._calibration = read_calibration(weights, self.config.solver.lattice)
+        self._run(_blank(self.config), None, semantics=False)  # what is compiled at its first use
         self._map_m = 1.5 * self.config.bev.half_m
 
     def __call__(
@@ -111,6 +113,20 @@ def _checked(search: ArrayLike) -> torch.Tensor:
     if given.shape != (3,) or not (given > 0.0).all():
         raise EgolocError(f"search: expected three numbers above 0 (m, m, rad), got {given.tolist()}")
     return torch.from_numpy(given[None])
+
+
+def _blank(config: NetworkConfig) -> Batch:
+    """A frame with one point, one black image and one piece of map, as far as the network has eyes for them."""
+    points = images = None
+    if config.lidar is not None:
+        points = Points(torch.zeros(1, 3), torch.zeros(1), torch.zeros(1), torch.zeros(1, dtype=torch.int64))
+    if config.camera is not None:
+        rgb = torch.zeros(1, 1, 3, *config.camera.image_hw)
+        places = torch.eye(3)[None, None], torch.eye(4)[None, None]
+        images = Images(rgb, *places, torch.ones(1, 1, dtype=torch.bool))
+    numbers = torch.zeros(1, 1, 2, 3), torch.zeros(1, 1), torch.zeros(1, 1, 3), torch.zeros(1, 1, 2)
+    piece = MapElements(torch.zeros(1, 1, dtype=torch.int64), *numbers, torch.ones(1, 1, dtype=torch.bool))
+    return Batch(points, images, piece)
 
 
 def _holds_data(inputs: FrameInputs) -> bool:

@@ -34,6 +34,7 @@ class Export:
 
     def run(self, _: tuple[str, ...]) -> None:
         """Export, compare, and say how far the answers differ."""
+        from egovm.calibration import calibration_path, read_calibration
         from egovm.export import check_installed, write_onnx
 
         check_installed()
@@ -56,11 +57,14 @@ class Export:
         mode = chosen_mode(config, self.mode)
         trained = EgoVM(config)
         load_weights(trained, path)
+        notes = {"weights": path.name}
+        if read_calibration(path, config.solver.lattice).fit is not None:
+            notes["calibration"] = calibration_path(path).read_text()
         network = deployed(trained)
         with stage(f"exporting {path.name}, {mode}") as say:
             frames = list(sample_frames(config, mode))
             with whole_file(self.target) as partial:
-                write_onnx(network, config, mode, frames[0][1], partial, {"weights": path.name})
+                write_onnx(network, config, mode, frames[0][1], partial, notes)
                 say("comparing")
                 found = differences(network, partial, frames)
                 check_differences(found, self.target)
