@@ -6,6 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from egovm.config import PRESETS, Ablation
@@ -23,6 +24,8 @@ from sensors.maps.map_file import MapFile, open_map
 from sensors.maps.store import write_map
 from sensors.maps.vector_map import NO_SURFELS, VectorMap
 from tests.egovm.made_map import made
+from tests.egovm.scenes import TINY
+from tests.sensors.pictures import AHEAD, image
 
 Floats = NDArray[np.float64]
 
@@ -144,3 +147,26 @@ def test_what_cannot_be_used_is_refused(matcher: Matcher, sample: Sample, vector
     save_weights(EgoVM(regressing), regressing, tmp_path / "a6.safetensors")
     with pytest.raises(EgolocError, match=r"a6.safetensors: ablation: solver: expected histogram"):
         Matcher(tmp_path / "a6.safetensors")
+
+
+@pytest.mark.parametrize("seen", ["both", "image", "black image", "points"])
+def test_a_network_with_cameras_takes_what_a_frame_has(
+    seen: str, sample: Sample, vector_map: MapFile, tmp_path: Path
+) -> None:
+    """Untrained: no more is asked than a fix that states a covariance, one way or the other."""
+    torch.manual_seed(1)
+    save_weights(EgoVM(TINY), TINY, tmp_path / "tiny.safetensors")
+    matcher = Matcher(tmp_path / "tiny.safetensors")
+    taken = image(T0, "ahead", "rgb8", T_body_camera=AHEAD)
+    if seen == "black image":
+        taken = replace(taken, data=bytes(len(taken.data)))
+    frame = replace(
+        frame_of(sample),
+        sweeps=frame_of(sample).sweeps if seen in {"both", "points"} else (),
+        images=() if seen == "points" else (taken,),
+    )
+    match = matcher(frame, vector_map, sample.T_map_body, ground_m=sample.ground_m)
+    assert match.found
+    assert np.isfinite(match.pose).all()
+    assert (np.linalg.eigvalsh(match.cov) > 0.0).all()
+    assert len(match.fix()) == 1
