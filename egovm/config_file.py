@@ -5,7 +5,6 @@ Where a config says None (no camera), the file says "none": TOML has no such val
 
 import json
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,16 +13,6 @@ import msgspec
 from sensors.errors import EgolocError
 
 T = TypeVar("T")
-
-
-def replaced(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file under another name, then give it its own: a reader, or a kill, meets the old one or the new."""
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    try:
-        write(unfinished)
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def read_toml(path: Path, kind: type[T], what: str) -> T:

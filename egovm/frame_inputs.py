@@ -18,6 +18,7 @@ from torch import Tensor
 from egovm.batch import Images, Points
 from egovm.config import BevConfig, CameraConfig, NetworkConfig
 from egovm.projection import ground_under
+from egovm.sample import FULL_INTENSITY
 from egovm.timm_models import normalization
 from sensors.errors import EgolocError
 from sensors.frames import Frame
@@ -25,9 +26,6 @@ from sensors.images import Image
 from sensors.motion import Motion, Standing, points_at, relative, span_of
 
 Floats = NDArray[np.float64]
-
-FULL_INTENSITY = 255.0
-"""What LiDARs give at most (nuScenes, Argoverse 2, our simulation); more is cut off."""
 
 
 class FrameInputs(NamedTuple):

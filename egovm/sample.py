@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sensors.maps.vector_map import Elements, Surfels
+from sensors.whole_file import whole_file
 
 Floats = NDArray[np.float64]
 
 FULL_INTENSITY = 255.0
-"""Intensity that the network takes as 1."""
+"""What LiDARs give at most (nuScenes, Argoverse 2, our simulation): the network takes it, and more, as 1."""
 _POINT_M, _OFFSET_S = 0.002, 1e-4
 """Steps in files."""
 _CODES = ("kind", "style", "colour", "first", "xyz")
@@ -42,21 +43,16 @@ def save_sample(sample: Sample, path: Path) -> None:
     columns = {f"map_{name}": getattr(sample.elements, name) for name in _CODES}
     columns |= {f"surfel_{name}": getattr(sample.surfels, name).astype(np.float32) for name in _SURFEL[2:]}
     columns |= {f"surfel_{name}": getattr(sample.surfels, name) for name in _SURFEL[:2]}
-    unfinished = path.with_name(f".{path.name}.{np.random.default_rng().integers(2**62)}")
-    try:
-        with unfinished.open("wb") as file:
-            np.savez(
-                file,
-                xyz=np.rint(sample.xyz / _POINT_M).astype(np.int16),
-                intensity=np.rint(sample.intensity * FULL_INTENSITY).astype(np.uint8),
-                offset=np.rint(sample.offset_s / _OFFSET_S).astype(np.int16),
-                T_map_body=sample.T_map_body,
-                ground_m=sample.ground_m,
-                **columns,
-            )
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with whole_file(path) as part, part.open("wb") as file:
+        np.savez(
+            file,
+            xyz=np.rint(sample.xyz / _POINT_M).astype(np.int16),
+            intensity=np.rint(sample.intensity * FULL_INTENSITY).astype(np.uint8),
+            offset=np.rint(sample.offset_s / _OFFSET_S).astype(np.int16),
+            T_map_body=sample.T_map_body,
+            ground_m=sample.ground_m,
+            **columns,
+        )
 
 
 def load_sample(path: Path) -> Sample:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from egovm.batch import Batch, Truth
-from egovm.config_file import config_toml, read_toml, replaced
+from egovm.config_file import config_toml, read_toml
 from egovm.dataset import TrainingBatches, loader
 from egovm.judging import judged
 from egovm.losses import network_losses
@@ -25,6 +25,7 @@ from egovm.network import EgoVM
 from egovm.train_config import TrainConfig
 from egovm.weights import save_weights
 from sensors.errors import EgolocError
+from sensors.whole_file import whole_file
 
 CONFIG, LOG, CHECKPOINT, WEIGHTS = "config.toml", "log.jsonl", "checkpoint.pt", "weights.safetensors"
 Entry = dict[str, Any]
@@ -49,7 +50,8 @@ def train(config: TrainConfig, folder: Path, cache: Path, tell: Callable[[Entry]
     if (folder / CONFIG).exists():
         raise EgolocError(f"{folder}: expected a new folder, found a training: --resume goes on with it")
     folder.mkdir(parents=True, exist_ok=True)
-    replaced(folder / CONFIG, lambda to: to.write_text(config_toml(config)))
+    with whole_file(folder / CONFIG) as part:
+        part.write_text(config_toml(config))
     return _run(begun(config), folder, cache, tell)
 
 
@@ -157,7 +159,8 @@ def checkpoint(training: Training, path: Path) -> None:
         "step": training.step,
         "seconds": training.seconds,
     }
-    replaced(path, lambda to: torch.save(held, to))
+    with whole_file(path, RuntimeError) as part:  # torch's, where it cannot write
+        torch.save(held, part)
 
 
 def _restore(training: Training, path: Path) -> None:
@@ -173,7 +176,8 @@ def _cut_log(path: Path, step: int) -> None:
         return
     lines = path.read_text().splitlines(keepends=True)
     kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] < step]
-    replaced(path, lambda to: to.write_text("".join(kept)))
+    with whole_file(path) as part:
+        part.write_text("".join(kept))
 
 
 def _errors(estimate: Any, truth: Truth) -> Entry:

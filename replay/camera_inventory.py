@@ -4,19 +4,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
+from replay.lidar_inventory import with_timing
 
 
 def file_cameras(path: Path, topics: Mapping[str, str], found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The topics of images of a log, JSON-ready, with counts and rates of those that ``file_inventory`` found."""
     from sensors.mcap.camera_summary import camera_topics
 
-    by_name = {topic["name"]: topic for topic in found}
-    told = []
-    for camera in camera_topics(path, topics.get("camera")):
-        timing = {key: by_name[camera.name][key] for key in ("count", "rate_hz")} if camera.name in by_name else {}
-        told.append(msgspec.to_builtins(camera) | timing)
-    return told
+    return with_timing(camera_topics(path, topics.get("camera")), found)
 
 
 def camera_text(camera: Mapping[str, Any]) -> str:

@@ -48,11 +48,16 @@ def file_lidars(path: Path, topics: Mapping[str, str], found: list[dict[str, Any
     """The LiDAR topics of a log, JSON-ready, with counts and rates of its topics as ``file_inventory`` found them."""
     from sensors.mcap.lidar_summary import lidar_topics
 
+    return with_timing(lidar_topics(path, topics.get("lidar")), found)
+
+
+def with_timing(summaries: Iterable[Any], found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Summaries of topics (structs with a name), JSON-ready, each with what was found of its messages."""
     by_name = {topic["name"]: topic for topic in found}
     told = []
-    for lidar in lidar_topics(path, topics.get("lidar")):
-        timing = {key: by_name[lidar.name][key] for key in ("count", "rate_hz")} if lidar.name in by_name else {}
-        told.append(msgspec.to_builtins(lidar) | timing)
+    for each in summaries:
+        timing = {key: by_name[each.name][key] for key in ("count", "rate_hz")} if each.name in by_name else {}
+        told.append(msgspec.to_builtins(each) | timing)
     return told
 
 

@@ -10,8 +10,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from egovm.config import NetworkConfig
-from egovm.config_file import config_toml, read_toml, replaced
+from egovm.config_file import config_toml, read_toml
 from sensors.errors import EgolocError
+from sensors.whole_file import whole_file
 
 HERE = Path(__file__).parent
 
@@ -26,8 +27,10 @@ def save_weights(network: nn.Module, config: NetworkConfig, path: Path) -> None:
     """Write path (.safetensors) and the config beside it (.toml), each under its name only once it is complete."""
     _check_name(path)
     state = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    replaced(path.with_suffix(".toml"), lambda to: to.write_text(config_toml(config)))
-    replaced(path, lambda to: save_file(state, to))
+    with whole_file(path.with_suffix(".toml")) as part:
+        part.write_text(config_toml(config))
+    with whole_file(path, SafetensorError) as part:
+        save_file(state, part)
 
 
 def read_config(path: Path) -> NetworkConfig:
