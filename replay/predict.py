@@ -168,7 +168,8 @@ class _Matching:
             if self._starts is None:
                 self._starts = self._begin(piece)
             self._starts.add(piece)
-            self._truth.add(piece)
+            if self._chosen.count:
+                self._truth.add(piece)
             until_ns = None if last else self._starts.known_ns()
             rows = [fix for frame in waiting.until(until_ns) if len(fix := self._fix(frame, self._starts))]
             self.tally.log_left_out = summed((*self.tally.log_left_out, *piece.left_out))
